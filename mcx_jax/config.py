@@ -1,0 +1,304 @@
+"""Every setting of the program, each with one default and one sentence; validated on construction.
+
+The command lines are generated from these dataclasses (`mcx_jax.cli`), so a field's docstring is
+its help text. Derived values are properties. All classes are hashable: they are static under jit.
+"""
+
+import re
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from mcx_jax.errors import UserError
+
+PHYSICS_DT_S = 0.002
+"""Physics step: 500 Hz (paper; authors' code)."""
+SUBSTEPS = 10
+"""Physics steps per control step."""
+CONTROL_DT_S = PHYSICS_DT_S * SUBSTEPS
+"""Control step: 50 Hz (paper; authors' code)."""
+NYQUIST_HZ = 0.5 / CONTROL_DT_S
+
+NAMED_DELAYS = {
+    "E0": "explicit:0",
+    "E1": "explicit:1",
+    "E2": "explicit:2",
+    "B4_21": "butter:4:20.8Hz",
+    "B4_4": "butter:4:10.4Hz",
+}
+"""The five delays of the paper's table 2. "B(4,4)" is an erratum of the paper: 4 Hz would delay by
+98 ms; the authors' code has 0.416 of Nyquist = 10.4 Hz, 34 ms, and only that fits table 3."""
+
+
+@dataclass(frozen=True)
+class Delay:
+    """How late the arm answers: a queue of control steps, or a low-pass filter, on the joint
+    references (paper section 3, table 2)."""
+
+    name: str
+    steps: int = 0
+    """Explicit delay k in control steps of 20 ms."""
+    order: int = 0
+    """Order of the Butterworth filter; 0 = no filter."""
+    cutoff_hz: float = 0.0
+    """-3 dB frequency of the Butterworth filter."""
+
+    @property
+    def group_delay_s(self) -> float:
+        """Delay of a slow motion, seconds: k * 20 ms, or the filter's group delay at 0 Hz."""
+        return self.steps * CONTROL_DT_S + _butter_dc_group_delay_s(self.order, self.cutoff_hz)
+
+    def describe(self) -> str:
+        """One line with the true cutoff and delay, printed whenever a delay is named."""
+        if self.order:
+            return (
+                f"{self.name}: Butterworth order {self.order}, cutoff {self.cutoff_hz:g} Hz, "
+                f"group delay {1e3 * self.group_delay_s:.1f} ms at 0 Hz"
+            )
+        return f"{self.name}: explicit delay of {self.steps} control steps = {1e3 * self.group_delay_s:.0f} ms"
+
+
+def _butter_dc_group_delay_s(order: int, cutoff_hz: float) -> float:
+    """Group delay at 0 Hz of the bilinear-transformed Butterworth low-pass.
+
+    An analogue pole pair contributes sin(theta)/w_c each, summing to 1/(w_c) * sum over poles of
+    Re(-1/p); the bilinear map with prewarping has w_c = (2/T) tan(pi f_c T) and dw/dW = 1 at 0.
+    """
+    if order == 0:
+        return 0.0
+    import math
+
+    wc = 2.0 / CONTROL_DT_S * math.tan(math.pi * cutoff_hz * CONTROL_DT_S)
+    angles = [math.pi * (2 * k + 1) / (2 * order) for k in range(order)]
+    return sum(math.sin(angle) for angle in angles) / wc
+
+
+def parse_delay(text: str) -> Delay:
+    """Read `E3`, `B4_4`, `B4_21` or a literal `butter:ORDER:CUTOFFHz`.
+
+    Raises:
+        UserError: unknown form, cutoff at or above Nyquist (25 Hz), order or steps out of range.
+    """
+    literal = NAMED_DELAYS.get(text, text)
+    if match := re.fullmatch(r"(?:explicit:|E)(\d+)", literal):
+        steps = int(match[1])
+        if steps > 50:
+            raise UserError(f"--delay {text}: at most 50 control steps (1 s), e.g. E5")
+        return Delay(name=text, steps=steps)
+    if match := re.fullmatch(r"butter:(\d+):(\d+(?:\.\d+)?)(?:Hz)?", literal):
+        order, cutoff_hz = int(match[1]), float(match[2])
+        if not 1 <= order <= 12:
+            raise UserError(f"--delay {text}: the filter order must be 1 to 12")
+        if not 0.1 <= cutoff_hz < NYQUIST_HZ:
+            raise UserError(
+                f"--delay {text}: the cutoff must be at least 0.1 Hz and below the Nyquist "
+                f"frequency {NYQUIST_HZ:g} Hz (control runs at 50 Hz)"
+            )
+        return Delay(name=text, order=order, cutoff_hz=cutoff_hz)
+    raise UserError(
+        f"unknown delay '{text}': use one of {', '.join(NAMED_DELAYS)}, E<k> for k control steps, "
+        "or butter:<order>:<cutoff>Hz, e.g. butter:4:7.5Hz"
+    )
+
+
+def _require(ok: bool, message: str) -> None:
+    if not ok:
+        raise UserError(message)
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """The simulated task. Frames: I inertial, B arm base (on vessel A), E tool, G goal (on B)."""
+
+    delay: str = "B4_4"
+    """Actuation delay: E0, E1, E2, B4_21, B4_4 (the paper's names), E<k>, butter:<order>:<Hz>Hz."""
+    arm: str = "paper"
+    """Arm model: paper (table 3's UR10e), ur10e (manufacturer's inertia), or an MJCF file."""
+    tool_site: str = "tool"
+    """Name of the site in the arm model that is the tool centre point E."""
+    physics: Literal["chain", "mjx"] = "chain"
+    """Engine: chain (this project's, fast) or mjx (MuJoCo's own, the reference)."""
+    integrator: Literal["model", "euler", "implicitfast"] = "model"
+    """Integrator of the arm; model = as the arm's file says (paper: euler, ur10e: implicitfast)."""
+    episode_steps: int = 1000
+    """Control steps of 20 ms in an episode."""
+
+    def __post_init__(self) -> None:
+        parse_delay(self.delay)
+        _require(
+            10 <= self.episode_steps <= 100_000,
+            f"--episode-steps {self.episode_steps}: must be 10 to 100000 control steps of 20 ms",
+        )
+
+    @property
+    def parsed_delay(self) -> Delay:
+        """The delay as numbers."""
+        return parse_delay(self.delay)
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """PPO with a recurrent policy. Defaults = preset `fast`."""
+
+    window_steps: int = 32
+    """Control steps collected from every environment in one iteration."""
+    sequence_steps: int = 32
+    """Length of back-propagation through time; divides window_steps."""
+    epochs: int = 2
+    """Passes over the collected window in one iteration (policy and value at most that many)."""
+    minibatches: int = 8
+    """Minibatches of whole sequences per pass."""
+    gamma: float = 0.9
+    """Discount per control step."""
+    gae_lambda: float = 0.9
+    """Lambda of generalised advantage estimation."""
+    clip: float = 0.15
+    """Clipping of the probability ratio."""
+    entropy_coef: float = 0.0
+    """Weight of the policy's entropy."""
+    target_kl: float = 0.05
+    """Policy updates of an iteration stop when the KL estimate exceeds 1.5 times this."""
+    policy_lr: float = 1e-3
+    """Adam step size of the policy."""
+    value_lr: float = 1e-3
+    """Adam step size of the value network."""
+    lr_decay: Literal["constant", "cosine"] = "cosine"
+    """Schedule of both step sizes over --total-steps (cosine ends at 5 %)."""
+    max_grad_norm: float = 1.0
+    """Global-norm clipping of each network's gradient; 0 = none."""
+    value_target: Literal["lambda", "discounted"] = "lambda"
+    """Value target: GAE return (lambda) or the paper's discounted return."""
+    initial_sigma: float = 0.3
+    """Initial standard deviation of the actions, centimetres and centiradians (paper: 1.31)."""
+    hidden: int = 128
+    """Width of the two dense layers and of the LSTM."""
+    reject_mean_sq_reward: float = 0.008
+    """A window (paper: episode) with a larger mean squared reward is masked out (authors' code)."""
+
+    def __post_init__(self) -> None:
+        positive = {
+            "window-steps": self.window_steps,
+            "sequence-steps": self.sequence_steps,
+            "epochs": self.epochs,
+            "minibatches": self.minibatches,
+            "hidden": self.hidden,
+            "policy-lr": self.policy_lr,
+            "value-lr": self.value_lr,
+            "initial-sigma": self.initial_sigma,
+        }
+        for name, value in positive.items():
+            _require(value > 0, f"--{name} {value}: must be positive")
+        _require(0 < self.gamma <= 1, f"--gamma {self.gamma}: must be above 0 and at most 1")
+        _require(0 <= self.gae_lambda <= 1, f"--gae-lambda {self.gae_lambda}: must be 0 to 1")
+        _require(
+            self.window_steps % self.sequence_steps == 0,
+            f"--sequence-steps {self.sequence_steps} must divide --window-steps "
+            f"{self.window_steps}",
+        )
+
+
+PAPER_PPO = PPOConfig(
+    window_steps=1000,
+    sequence_steps=1000,
+    epochs=80,
+    minibatches=1,
+    gamma=0.99,
+    gae_lambda=0.97,
+    clip=0.15,
+    entropy_coef=0.01,
+    target_kl=0.01,
+    policy_lr=1e-4,
+    value_lr=1e-4,
+    lr_decay="constant",
+    max_grad_norm=0.0,
+    value_target="discounted",
+    initial_sigma=1.3132616875182228,
+)
+"""The paper's schedule to the letter (facts: networks and training). sigma = softplus(1)."""
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """Where the vessels' motion comes from."""
+
+    sea: str = "all"
+    """Sea: all (Wa..Wd, one drawn per episode), one of Wa Wb Wc Wd, or Hs:Tp full scale (m:s)."""
+    motion: str = ""
+    """Recorded motion instead of the generator: .npy or .csv, columns t,x,y,z,roll,pitch,yaw."""
+    motion_length_unit: Literal["m", "mm"] = "m"
+    """Unit of x, y, z in --motion (the authors' files: mm)."""
+    motion_angle_unit: Literal["rad", "deg"] = "rad"
+    """Unit of roll, pitch, yaw in --motion (the authors' files: deg)."""
+    motion_scale: float = 1.0
+    """Froude scale of --motion: lengths are divided by it, time by its root (already scaled: 1)."""
+    coupled: bool = False
+    """Both vessels in one wave field instead of independent windows (the paper: independent)."""
+    split: Literal["seeds", "paper"] = "seeds"
+    """Test motion: another wave seed (seeds), or the last third of the same hour (paper)."""
+
+    def __post_init__(self) -> None:
+        _require(self.motion_scale > 0, f"--motion-scale {self.motion_scale}: must be positive")
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything that defines a training run (stored as config.json in the run directory)."""
+
+    preset: Literal["fast", "paper"] = "fast"
+    """Defaults of all other settings: fast, or the paper's schedule to the letter."""
+    algo: Literal["ppo"] = "ppo"
+    """Learning algorithm."""
+    num_envs: int = 2048
+    """Environments stepped in parallel."""
+    total_steps: int = 20_000_000
+    """Control steps of training, summed over the environments (paper: 20 M)."""
+    seed: int = 0
+    """Random seed."""
+    seeds: int = 1
+    """Train this many seeds (seed, seed+1, ...) in one vmapped call."""
+    env: EnvConfig = field(default_factory=EnvConfig)
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+
+    def __post_init__(self) -> None:
+        for name in ("num_envs", "total_steps", "seeds"):
+            value = getattr(self, name)
+            _require(value > 0, f"--{name.replace('_', '-')} {value}: must be a positive integer")
+        _require(self.seed >= 0, f"--seed {self.seed}: must be 0 or a positive integer")
+        sequences = self.num_envs * (self.ppo.window_steps // self.ppo.sequence_steps)
+        _require(
+            sequences % self.ppo.minibatches == 0,
+            f"--num-envs {self.num_envs} gives {sequences} sequences a window, which --minibatches "
+            f"{self.ppo.minibatches} does not divide; use a multiple of {self.ppo.minibatches}",
+        )
+        _require(
+            self.env.episode_steps % self.ppo.window_steps == 0,
+            f"--episode-steps {self.env.episode_steps} must be a multiple of --window-steps "
+            f"{self.ppo.window_steps}",
+        )
+
+    @property
+    def reset_groups(self) -> int:
+        """Environments are reset in this many groups, one group per window (see ppo.rollout)."""
+        return self.env.episode_steps // self.ppo.window_steps
+
+    @property
+    def steps_per_iteration(self) -> int:
+        """Control steps collected per iteration and seed."""
+        return self.num_envs * self.ppo.window_steps
+
+    @property
+    def iterations(self) -> int:
+        """Iterations needed for total_steps, rounded up."""
+        return -(-self.total_steps // self.steps_per_iteration)
+
+
+def preset_config(preset: str) -> TrainConfig:
+    """The defaults of a preset: `fast` (32-step windows, 1024-step episodes) or `paper`."""
+    fast = TrainConfig(env=EnvConfig(episode_steps=1024))
+    if preset == "fast":
+        return fast
+    if preset == "paper":
+        return replace(
+            fast, preset="paper", num_envs=8, env=EnvConfig(episode_steps=1000), ppo=PAPER_PPO
+        )
+    raise UserError(f"unknown preset '{preset}': use fast or paper")

@@ -1,0 +1,1 @@
+"""The simulated world: arm dynamics, inverse kinematics, actuation delay, vessels, observation."""

@@ -1,0 +1,1 @@
+"""Recurrent PPO: networks, advantage estimation, sequences, losses and the compiled iteration."""

@@ -1,0 +1,86 @@
+"""Process set-up shared by the commands: XLA flags by version, compilation cache, error lines.
+
+Nothing here runs on import of the library; a command calls `run_command(main)` as its last line.
+"""
+
+import os
+import sys
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+
+from mcx_jax.errors import UserError
+
+FUSION_FLAG = "--xla_cpu_use_fusion_emitters"
+"""From jaxlib 0.8 to 0.11.1 the default CPU fusion emitters run MJX, and reverse mode in general,
+100-300 times slower than the older ones; from 0.11.2 the flag is gone and aborts the process."""
+
+
+def xla_flags_for(jaxlib_version: str, current: str) -> str:
+    """The value of XLA_FLAGS for this jaxlib, never overwriting what the user has set.
+
+    Args:
+        jaxlib_version: e.g. "0.10.2".
+        current: the present value of XLA_FLAGS ("" if unset).
+    """
+    release = tuple(int("".join(c for c in part if c.isdigit()) or 0)
+                    for part in jaxlib_version.split(".")[:3])
+    if FUSION_FLAG in current or not (0, 8, 0) <= release <= (0, 11, 1):
+        return current
+    return f"{current} {FUSION_FLAG}=false".strip()
+
+
+def cache_dir() -> Path:
+    """Directory of JAX's persistent compilation cache (`MCX_JAX_CACHE` overrides; "" disables)."""
+    default = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "mcx_jax" / "xla"
+    return Path(os.environ.get("MCX_JAX_CACHE", str(default)))
+
+
+def configure(device: str = "auto") -> list[str]:
+    """Set XLA flags, the compilation cache and matmul precision; call before any JAX computation.
+
+    Args:
+        device: "auto", "cpu" or "gpu".
+
+    Returns:
+        One line for each thing that was set, for the user to read.
+
+    Raises:
+        UserError: a GPU was asked for and JAX finds none.
+    """
+    said = []
+    flags = xla_flags_for(version("jaxlib"), os.environ.get("XLA_FLAGS", ""))
+    if flags != os.environ.get("XLA_FLAGS", ""):
+        os.environ["XLA_FLAGS"] = flags
+        said.append(f"XLA_FLAGS += {FUSION_FLAG}=false (jaxlib {version('jaxlib')} on CPU)")
+    if device == "cpu":
+        os.environ["JAX_PLATFORMS"] = "cpu"
+    import jax
+
+    # TF32 would round the policy's inputs to 10 bits: 1 mm in 1 m, the size of the errors here.
+    jax.config.update("jax_default_matmul_precision", "float32")
+    if os.environ.get("MCX_JAX_CACHE") != "":
+        jax.config.update("jax_compilation_cache_dir", str(cache_dir()))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    if device == "gpu":
+        _require_gpu(jax)
+    return said
+
+
+def _require_gpu(jax) -> None:
+    try:
+        jax.devices("gpu")
+    except RuntimeError:
+        raise UserError(
+            "--device gpu: JAX finds no GPU here; install the 'cuda' extra on a machine with one, "
+            "or use --device cpu"
+        ) from None
+
+
+def run_command(main: Callable[[], None]) -> None:
+    """Run a command's `main`: a `UserError` becomes one line on stderr and exit code 2."""
+    try:
+        main()
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
