@@ -1,0 +1,1 @@
+"""Vessel motion in waves: spectrum -> response -> tables -> sampler, and recordings."""
