@@ -1,0 +1,288 @@
+"""Forward dynamics of a serial hinge arm on a moving base, as unrolled scalar expressions.
+
+Recursive Newton-Euler for the bias forces, composite rigid bodies for the mass matrix, L^T D L for
+the solve (Featherstone, Rigid Body Dynamics Algorithms, 2008, ch. 5-6), in link frames. The base's
+motion is prescribed: the recursion starts from its angular velocity, angular acceleration and
+acceleration, so an accelerating deck is exact and costs nothing.
+"""
+
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from mcx_jax.envs.model import Actuator, ChainModel, Link
+from mcx_jax.spatial import (
+    Mat,
+    Scalar,
+    Vec,
+    add,
+    cross,
+    matmul,
+    matvec,
+    mul,
+    rotate_z,
+    sub,
+    tmatvec,
+    total,
+    transpose,
+    vadd,
+    vscale,
+)
+
+BaseState = tuple[Vec, Vec, Vec]
+"""(w, al, a) of the base in base axes B: angular velocity rad/s, angular acceleration rad/s2, and
+acceleration of the base origin minus gravity, m/s2 (at rest and level: 0, 0, +9.81)."""
+
+
+def link_rotations(model: ChainModel, q: Sequence[Scalar]) -> list[Mat]:
+    """Orientation of every link in its parent, from the joint angles (rad)."""
+    return [
+        rotate_z(link.rotation, jnp.cos(angle - link.q_ref), jnp.sin(angle - link.q_ref))
+        for link, angle in zip(model.links, q, strict=True)
+    ]
+
+
+def bias_forces(
+    model: ChainModel, rotations: list[Mat], qd: Sequence[Scalar], base: BaseState
+) -> list[Scalar]:
+    """Joint torques that hold all joint accelerations at zero, N m (recursive Newton-Euler)."""
+    w, al, a = base
+    wrenches = []
+    for link, r, rate in zip(model.links, rotations, qd, strict=True):
+        a = tmatvec(r, vadd(a, _offset_acceleration(w, al, link.position)))
+        w_parent = tmatvec(r, w)
+        # The hinge is the link's z axis: w x (z qd) = (w_y qd, -w_x qd, 0).
+        al = vadd(tmatvec(r, al), (mul(w_parent[1], rate), -mul(w_parent[0], rate), 0.0))
+        w = vadd(w_parent, (0.0, 0.0, rate))
+        wrenches.append(_inertial_wrench(link, w, al, a))
+    return _project(model, rotations, wrenches)
+
+
+def _offset_acceleration(w: Vec, al: Vec, p: Vec) -> Vec:
+    """al x p + w x (w x p): acceleration of a point p fixed in a rotating frame."""
+    return vadd(cross(al, p), cross(w, cross(w, p)))
+
+
+def _inertial_wrench(link: Link, w: Vec, al: Vec, a: Vec) -> tuple[Vec, Vec]:
+    """Force and moment about the link origin that the link's motion needs."""
+    force = vadd(vscale(link.mass, a), _offset_acceleration(w, al, link.moment))
+    moment = vadd(
+        vadd(_apply_inertia(link.inertia, al), cross(w, _apply_inertia(link.inertia, w))),
+        cross(link.moment, a),
+    )
+    return force, moment
+
+
+def _apply_inertia(inertia: Sequence[Scalar], v: Vec) -> Vec:
+    xx, yy, zz, xy, xz, yz = inertia
+    return matvec(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)), v)
+
+
+def _project(model: ChainModel, rotations: list[Mat], wrenches: list) -> list[Scalar]:
+    """Sum the wrenches from tip to base; the torque of a joint is the moment about its z axis."""
+    torques: list[Scalar] = [0.0] * model.nq
+    force, moment = wrenches[-1]
+    for i in reversed(range(model.nq)):
+        torques[i] = moment[2]
+        if i:
+            force_up = matvec(rotations[i], force)
+            moment_up = vadd(
+                matvec(rotations[i], moment), cross(model.links[i].position, force_up)
+            )
+            force = vadd(wrenches[i - 1][0], force_up)
+            moment = vadd(wrenches[i - 1][1], moment_up)
+    return torques
+
+
+def mass_matrix(model: ChainModel, rotations: list[Mat]) -> list[list[Scalar]]:
+    """Lower triangle of the joint-space mass matrix, kg m2 (composite rigid bodies)."""
+    n = model.nq
+    mass_rows: list[list[Scalar]] = [[0.0] * (i + 1) for i in range(n)]
+    composite = None
+    for i in reversed(range(n)):
+        link = model.links[i]
+        composite = _merge(link, composite)
+        _, (hx, hy, _), (_, _, izz, _, ixz, iyz) = composite
+        mass_rows[i][i] = add(izz, link.armature)
+        force: Vec = (-hy, hx, 0.0)  # of a unit acceleration about z: z x h
+        moment: Vec = (ixz, iyz, izz)
+        for j in range(i, 0, -1):
+            force = matvec(rotations[j], force)
+            moment = vadd(matvec(rotations[j], moment), cross(model.links[j].position, force))
+            mass_rows[i][j - 1] = moment[2]
+        if i:
+            composite = _to_parent(composite, rotations[i], link.position)
+    return mass_rows
+
+
+def _merge(link: Link, outer):
+    """Mass properties of a link plus those of everything beyond it, in the link's frame."""
+    if outer is None:
+        return link.mass, link.moment, link.inertia
+    mass, moment, inertia = outer
+    summed = tuple(add(x, y) for x, y in zip(link.inertia, inertia, strict=True))
+    return add(link.mass, mass), vadd(link.moment, moment), summed
+
+
+def _to_parent(body, r: Mat, p: Vec):
+    """Mass properties expressed in the parent frame, about the parent's origin."""
+    mass, moment, (xx, yy, zz, xy, xz, yz) = body
+    half = matmul(r, ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
+    rotated = matmul(half, transpose(r))
+    h = matvec(r, moment)
+    # Parallel axes: 2 (p.h) 1 - (p h^T + h p^T) + m (p.p 1 - p p^T), with g = h + m p / 2.
+    g = vadd(h, vscale(0.5, vscale(mass, p)))
+    pg = [[mul(p[i], g[j]) for j in range(3)] for i in range(3)]
+    trace2 = mul(2.0, total([pg[0][0], pg[1][1], pg[2][2]]))
+
+    def shifted(i: int, j: int) -> Scalar:
+        diagonal = trace2 if i == j else 0.0
+        return add(rotated[i][j], sub(diagonal, add(pg[i][j], pg[j][i])))
+
+    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+    return mass, vadd(h, vscale(mass, p)), tuple(shifted(i, j) for i, j in pairs)
+
+
+def factor(rows: list[list[Scalar]]) -> tuple[list[list[Scalar]], list[Scalar]]:
+    """L^T D L factors of a symmetric positive matrix given by its lower triangle.
+
+    Returns:
+        (L, 1/D): unit lower rows without the diagonal, and the inverse diagonal.
+    """
+    n = len(rows)
+    a = [list(row) for row in rows]
+    inverse: list[Scalar] = [0.0] * n
+    for k in reversed(range(n)):
+        inverse[k] = 1.0 / a[k][k]
+        for i in reversed(range(k)):
+            scaled = mul(a[k][i], inverse[k])
+            for j in range(i + 1):
+                a[i][j] = sub(a[i][j], mul(scaled, a[k][j]))
+            a[k][i] = scaled
+    return [row[:-1] for row in a], inverse
+
+
+def solve(factors: tuple[list[list[Scalar]], list[Scalar]], b: Sequence[Scalar]) -> list[Scalar]:
+    """x of L^T D L x = b."""
+    lower, inverse = factors
+    n = len(b)
+    x = list(b)
+    for k in reversed(range(n)):
+        for i in range(k):
+            x[i] = sub(x[i], mul(lower[k][i], x[k]))
+    x = [mul(v, d) for v, d in zip(x, inverse, strict=True)]
+    for k in range(n):
+        for i in range(k):
+            x[k] = sub(x[k], mul(lower[k][i], x[i]))
+    return x
+
+
+def actuate(
+    model: ChainModel, q: Sequence[Scalar], qd: Sequence[Scalar], ctrl: Sequence[Scalar]
+) -> tuple[list[Scalar], list[Scalar]]:
+    """Joint torques of actuators and dampers, and minus their derivative by joint velocity.
+
+    Returns:
+        (torque N m, damping N m s/rad), one of each a joint. The damping of an actuator at its
+        force limit is left out, as MuJoCo's implicitfast does.
+    """
+    torque = [mul(-link.damping, rate) for link, rate in zip(model.links, qd, strict=True)]
+    damping: list[Scalar] = [link.damping for link in model.links]
+    for actuator, command in zip(model.actuators, ctrl, strict=True):
+        j = actuator.joint
+        force, slope = _actuator_force(actuator, q[j], qd[j], command)
+        torque[j] = add(torque[j], mul(actuator.gear, force))
+        damping[j] = add(damping[j], mul(actuator.gear**2, slope))
+    return torque, damping
+
+
+def _actuator_force(act: Actuator, q: Scalar, qd: Scalar, ctrl: Scalar) -> tuple[Scalar, Scalar]:
+    if act.ctrl_range is not None:
+        ctrl = jnp.clip(ctrl, *act.ctrl_range)
+    b0, b1, b2 = act.bias
+    # kp (ref - q) as one product: two products of 1e5 would cost 2 more digits of float32.
+    if b1 == -act.gain and act.gear == 1.0:
+        force = add(mul(act.gain, ctrl - q), add(b0, mul(b2, qd)))
+    elif b2 == -act.gain and act.gear == 1.0 and b1 == 0.0:
+        force = add(mul(act.gain, ctrl - qd), b0)
+    else:
+        length, velocity = mul(act.gear, q), mul(act.gear, qd)
+        force = total([mul(act.gain, ctrl), b0, mul(b1, length), mul(b2, velocity)])
+    if act.force_range is None:
+        return force, -b2
+    low, high = act.force_range
+    slope = 0.0 if b2 == 0.0 else jnp.where((force > low) & (force < high), -b2, 0.0)
+    return jnp.clip(force, low, high), slope
+
+
+def joint_accelerations(
+    model: ChainModel,
+    integrator: str,
+    q: Sequence[Scalar],
+    qd: Sequence[Scalar],
+    ctrl: Sequence[Scalar],
+    base: BaseState,
+) -> list[Scalar]:
+    """The acceleration that MuJoCo's integrator multiplies by the time step, rad/s2.
+
+    euler: M + h D with the joints' own damping D; implicitfast: the actuators' velocity derivative
+    as well (for a model without damping, euler's is the forward dynamics).
+    """
+    rotations = link_rotations(model, q)
+    torque, slopes = actuate(model, q, qd, ctrl)
+    rhs = [sub(t, b) for t, b in zip(torque, bias_forces(model, rotations, qd, base), strict=True)]
+    implicit = slopes if integrator == "implicitfast" else [link.damping for link in model.links]
+    matrix = mass_matrix(model, rotations)
+    for i, slope in enumerate(implicit):
+        matrix[i][i] = add(matrix[i][i], mul(model.timestep_s, slope))
+    return solve(factor(matrix), rhs)
+
+
+def substep(
+    model: ChainModel,
+    integrator: str,
+    q: Sequence[Scalar],
+    qd: Sequence[Scalar],
+    ctrl: Sequence[Scalar],
+    base: BaseState,
+) -> tuple[list[Scalar], list[Scalar]]:
+    """One physics step, semi-implicit as MuJoCo: new velocities, then positions with them."""
+    h = model.timestep_s
+    qdd = joint_accelerations(model, integrator, q, qd, ctrl, base)
+    qd = [v + h * a for v, a in zip(qd, qdd, strict=True)]
+    return [x + h * v for x, v in zip(q, qd, strict=True)], qd
+
+
+def substeps(
+    model: ChainModel,
+    integrator: str,
+    q: jax.Array,
+    qd: jax.Array,
+    ctrl: jax.Array,
+    base_at: Callable[[jax.Array], BaseState],
+    count: int,
+) -> tuple[jax.Array, jax.Array]:
+    """`count` physics steps with the actuator commands held.
+
+    Args:
+        q: (nq,) joint angles, rad.
+        qd: (nq,) joint velocities, rad/s.
+        ctrl: (nu,) actuator commands in the model's order.
+        base_at: base motion at physics step i of this control step.
+
+    Returns:
+        (q, qd) after the steps.
+    """
+    commands = [ctrl[i] for i in range(len(model.actuators))]
+
+    def body(i, state):
+        angles, rates = state
+        angles, rates = substep(model, integrator, angles, rates, commands, base_at(i))
+        return tuple(angles), tuple(rates)
+
+    n = model.nq
+    start = (tuple(q[i] for i in range(n)), tuple(qd[i] for i in range(n)))
+    angles, rates = lax.fori_loop(0, count, body, start)
+    return jnp.stack(angles), jnp.stack(rates)

@@ -1,0 +1,80 @@
+"""The late answer of a real arm: a queue of control steps and a Butterworth filter on references.
+
+Paper section 3 and table 2. Every lag is the same two stages, queue then filter; either may be
+empty, so there is one code path. The filter runs as second-order sections (the same difference
+equation as paper eq. 2b, but accurate in float32 for any order).
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from mcx_jax.config import NYQUIST_HZ, Delay
+
+
+@struct.dataclass
+class LagState:
+    """What the lag remembers."""
+
+    queue: jax.Array
+    """(k, nq) joint references of the last k control steps, oldest first, rad."""
+    sections: jax.Array
+    """(sections, 2, nq) transposed direct form II state of each second-order section, rad."""
+
+
+@functools.cache
+def sections(delay: Delay) -> tuple[tuple[float, ...], ...]:
+    """Second-order sections (b0, b1, b2, a1, a2) of the delay's filter; empty without one."""
+    if delay.order == 0:
+        return ()
+    from scipy.signal import butter
+
+    sos = butter(delay.order, delay.cutoff_hz / NYQUIST_HZ, output="sos")
+    return tuple((*map(float, s[:3]), float(s[4]), float(s[5])) for s in sos)
+
+
+def init(delay: Delay, first: jax.Array) -> LagState:
+    """Settled on the first input: a queue full of it, and the filter in steady state.
+
+    Until k references have arrived the queue thus returns its oldest entry, the first one (facts).
+
+    Args:
+        first: (nq,) joint reference, rad.
+    """
+    state = [
+        # Steady state of TDF-II for a constant x with unit DC gain of every section.
+        jnp.stack([(gain - b0) * first, (b2 - a2 * gain) * first])
+        for b0, b1, b2, a1, a2 in sections(delay)
+        for gain in [(b0 + b1 + b2) / (1.0 + a1 + a2)]
+    ]
+    # Sections other than the first see the previous section's output: scale by the gain so far.
+    gains = np.cumprod([1.0] + [(s[0] + s[1] + s[2]) / (1.0 + s[3] + s[4]) for s in sections(delay)])
+    scaled = [g * s for g, s in zip(gains, state, strict=False)]
+    return LagState(
+        queue=jnp.broadcast_to(first, (delay.steps, *first.shape)),
+        sections=jnp.stack(scaled) if scaled else jnp.zeros((0, 2, *first.shape), first.dtype),
+    )
+
+
+def apply(delay: Delay, state: LagState, x: jax.Array) -> tuple[LagState, jax.Array]:
+    """One control step: reference in, late reference out.
+
+    Args:
+        x: (nq,) joint reference, rad.
+
+    Returns:
+        (new state, (nq,) the reference that the arm's servo sees, rad).
+    """
+    queue = state.queue
+    if delay.steps:
+        x, queue = queue[0], jnp.concatenate([queue[1:], x[None]])
+    new = []
+    for (b0, b1, b2, a1, a2), z in zip(sections(delay), state.sections, strict=True):
+        y = b0 * x + z[0]
+        new.append(jnp.stack([b1 * x - a1 * y + z[1], b2 * x - a2 * y]))
+        x = y
+    filtered = jnp.stack(new) if new else state.sections
+    return LagState(queue=queue, sections=filtered), x

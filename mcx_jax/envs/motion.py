@@ -1,0 +1,116 @@
+"""Which motion an episode uses: tables on the device, and random windows drawn from them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from mcx_jax.config import CONTROL_DT_S, SUBSTEPS, MotionConfig
+from mcx_jax.errors import UserError
+from mcx_jax.sea.sampler import KNOT_STEPS
+
+NAMED_SEAS = ("Wa", "Wb", "Wc", "Wd")
+LOOK_AHEAD_STEPS = 100
+"""Control steps that stay readable after an episode's end (2 s), for the `preview` bound."""
+
+
+@struct.dataclass
+class Motion:
+    """Tables of vessel motion and how episodes draw windows from them."""
+
+    knots_a: jax.Array
+    """(tables, knots + 1, 12): x y z m, roll pitch yaw rad, their rates; one knot each 0.1 s."""
+    knots_b: jax.Array
+    """The same for vessel B; the same array unless the vessels share one wave field."""
+    seas: tuple[str, ...] = struct.field(pytree_node=False)
+    """Name of each sea; tables are ordered [sea, seed]."""
+    seeds: int = struct.field(pytree_node=False)
+    """Tables per sea."""
+    first_start: int = struct.field(pytree_node=False)
+    """Earliest window start, control steps of 20 ms."""
+    last_start: int = struct.field(pytree_node=False)
+    """Latest window start, control steps of 20 ms (inclusive)."""
+    coupled: bool = struct.field(pytree_node=False, default=False)
+    """Both vessels use the same window (one wave field)."""
+
+
+@struct.dataclass
+class Track:
+    """The windows of motion that one episode uses."""
+
+    table: jax.Array
+    """() int32: row of the tables."""
+    start_a: jax.Array
+    """() int32: vessel A's first physics step (2 ms) in the table, a multiple of 10."""
+    start_b: jax.Array
+    """() int32: vessel B's."""
+
+
+def draw_track(motion: Motion, key: jax.Array, sea: jax.Array | int | None = None) -> Track:
+    """Independent random windows of one table for the two vessels.
+
+    Args:
+        sea: index into motion.seas; None draws one.
+    """
+    key_sea, key_seed, key_a, key_b = jax.random.split(key, 4)
+    if sea is None:
+        sea = jax.random.randint(key_sea, (), 0, len(motion.seas))
+    seed = jax.random.randint(key_seed, (), 0, motion.seeds)
+    low, high = motion.first_start, motion.last_start + 1
+    start_a = SUBSTEPS * jax.random.randint(key_a, (), low, high)
+    start_b = SUBSTEPS * jax.random.randint(key_b, (), low, high)
+    table = jnp.asarray(sea * motion.seeds + seed, jnp.int32)
+    return Track(table=table, start_a=start_a, start_b=start_a if motion.coupled else start_b)
+
+
+def load_motion(config: MotionConfig, episode_steps: int, split: str) -> Motion:
+    """Tables for training ("train") or evaluation ("test"), generated or from a recording.
+
+    Raises:
+        UserError: unknown sea, or a recording that cannot be used.
+    """
+    needed_steps = episode_steps + LOOK_AHEAD_STEPS
+    if config.motion:
+        names, knots_a, knots_b = _recorded(config, needed_steps * CONTROL_DT_S, split)
+    else:
+        names, knots_a, knots_b = _generated(config, split)
+    last_start = (knots_a.shape[1] - 1) * KNOT_STEPS // SUBSTEPS - needed_steps - 1
+    if last_start < 0:
+        raise UserError(
+            f"--episode-steps {episode_steps}: an episode of {episode_steps * CONTROL_DT_S:g} s and "
+            f"2 s of look-ahead do not fit into {knots_a.shape[1] * 0.1:g} s of motion"
+        )
+    device_a = jnp.asarray(knots_a, jnp.float32)
+    return Motion(
+        knots_a=device_a,
+        knots_b=device_a if knots_b is None else jnp.asarray(knots_b, jnp.float32),
+        seas=names,
+        seeds=knots_a.shape[0] // len(names),
+        first_start=0,
+        last_start=last_start,
+        coupled=config.coupled,
+    )
+
+
+def _generated(config: MotionConfig, split: str):
+    from mcx_jax.sea.spectrum import parse_sea
+    from mcx_jax.sea.tables import build_tables
+
+    names = NAMED_SEAS if config.sea == "all" else (config.sea,)
+    tables = build_tables(
+        [parse_sea(name) for name in names], split, coupled=config.coupled, split=config.split  # type: ignore[arg-type]
+    )
+    return tables.sea_names, tables.knots, tables.companion
+
+
+def _recorded(config: MotionConfig, needed_s: float, split: str):
+    from mcx_jax.sea.recording import load_recording, split_recording
+
+    knots = load_recording(
+        config.motion,
+        length_unit=config.motion_length_unit,
+        angle_unit=config.motion_angle_unit,
+        scale=config.motion_scale,
+    )
+    part = split_recording(knots, split)
+    return ("motion",), np.asarray(part)[None], None

@@ -1,0 +1,127 @@
+"""The two vessels: poses and rates at an instant, and the goal as seen from the arm's base.
+
+Vessel A carries the arm: its deck origin is the arm's base B. Vessel B carries the goal G. A
+vessel's position is its rest position plus the sampled (x, y, z) in world axes, not turned with the
+rest pose; its orientation is the rest rotation times Rz(yaw) Ry(pitch) Rx(roll) (authors' code).
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from mcx_jax.config import SUBSTEPS
+from mcx_jax.envs.motion import Motion, Track
+from mcx_jax.sea.sampler import KNOT_STEPS, hermite, segment_rows
+from mcx_jax.spatial import (
+    Mat,
+    Scalar,
+    Vec,
+    cross,
+    matmul,
+    matvec,
+    rotation_rpy,
+    tmatvec,
+    transpose,
+    vadd,
+    vsub,
+)
+
+GRAVITY_M_S2 = 9.81
+REST_B_M: Vec = (0.65, 0.0, 0.0)
+"""Vessel B's rest position (authors' code); vessel A rests at the origin."""
+REST_B: Mat = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
+"""Vessel B is turned 180 deg about z: the vessels face each other."""
+GOAL_ROTATION: Mat = ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
+"""R_Vb_G: half a turn about (cos 45 deg, sin 45 deg, 0): the goal's z points down."""
+GOAL_LOW_M: Vec = (-0.1, -0.1, 0.1)
+GOAL_HIGH_M: Vec = (0.1, 0.1, 0.3)
+"""Box on vessel B in which the goal's position is drawn (paper; authors' code)."""
+
+
+@struct.dataclass
+class Segment:
+    """Two neighbouring knots and the place between them where a control step begins.
+
+    KNOT_STEPS is a multiple of SUBSTEPS, so a control step never straddles a knot.
+    """
+
+    row0: jax.Array
+    row1: jax.Array
+    first: jax.Array
+    """() int32: physics steps from row0 to the beginning of the control step."""
+
+    def at(self, i: jax.Array | int) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Position (x y z m, roll pitch yaw rad), rate and acceleration at physics step i."""
+        return hermite(self.row0, self.row1, self.first + i)
+
+
+def segment(knots: jax.Array, table: jax.Array, step: jax.Array) -> Segment:
+    """The segment that holds a physics step (int32, never float seconds) of a table."""
+    row0, row1 = segment_rows(knots, table, step)
+    return Segment(row0=row0, row1=row1, first=step % KNOT_STEPS)
+
+
+def still(seg: Segment) -> Segment:
+    """A vessel held at the segment's first pose."""
+    x, _, _ = seg.at(0)
+    row = jnp.concatenate([x, jnp.zeros_like(x)])
+    return Segment(row0=row, row1=row, first=seg.first)
+
+
+def base_state(seg: Segment, i: jax.Array | int) -> tuple[Vec, Vec, Vec]:
+    """Vessel A's (w, al, a) in its own axes at physics step i, as `chain.BaseState`."""
+    x, xd, xdd = seg.at(i)
+    roll, pitch, yaw = x[3], x[4], x[5]
+    rotation = rotation_rpy(roll, pitch, yaw)
+    w, al = _body_rates(roll, pitch, xd, xdd)
+    return w, al, tmatvec(rotation, (xdd[0], xdd[1], xdd[2] + GRAVITY_M_S2))
+
+
+def _body_rates(roll: Scalar, pitch: Scalar, xd: jax.Array, xdd: jax.Array) -> tuple[Vec, Vec]:
+    """Angular velocity and acceleration in body axes from Euler angle rates (rpy, R = Rz Ry Rx)."""
+    (dr, dp, dy), (ddr, ddp, ddy) = (xd[3], xd[4], xd[5]), (xdd[3], xdd[4], xdd[5])
+    cr, sr, cp, sp = jnp.cos(roll), jnp.sin(roll), jnp.cos(pitch), jnp.sin(pitch)
+    w = (dr - dy * sp, dp * cr + dy * cp * sr, -dp * sr + dy * cp * cr)
+    al = (
+        ddr - ddy * sp - dy * dp * cp,
+        ddp * cr - dp * dr * sr + ddy * cp * sr - dy * dp * sp * sr + dy * dr * cp * cr,
+        -ddp * sr - dp * dr * cr + ddy * cp * cr - dy * dp * sp * cr - dy * dr * cp * sr,
+    )
+    return w, al
+
+
+def goal_in_base(seg_a: Segment, seg_b: Segment, goal_m: Vec, i: int | jax.Array) -> tuple[Mat, Vec]:
+    """T_G^B = (R_B_G, p_B_G): the goal as seen from the arm's base at physics step i.
+
+    Args:
+        goal_m: position of the goal on vessel B, m.
+    """
+    xa, _, _ = seg_a.at(i)
+    xb, _, _ = seg_b.at(i)
+    r_a = rotation_rpy(xa[3], xa[4], xa[5])
+    r_b = matmul(REST_B, rotation_rpy(xb[3], xb[4], xb[5]))
+    p_b = vadd(REST_B_M, (xb[0], xb[1], xb[2]))
+    goal = vadd(p_b, matvec(r_b, goal_m))
+    to_base = transpose(r_a)
+    return (
+        matmul(matmul(to_base, r_b), GOAL_ROTATION),
+        matvec(to_base, vsub(goal, (xa[0], xa[1], xa[2]))),
+    )
+
+
+def goal_pose(motion: Motion, track: Track, goal_m: Vec, step: jax.Array) -> tuple[Mat, Vec]:
+    """T_G^B at a physics step counted from the episode's beginning."""
+    seg_a = segment(motion.knots_a, track.table, track.start_a + step)
+    seg_b = segment(motion.knots_b, track.table, track.start_b + step)
+    return goal_in_base(seg_a, seg_b, goal_m, 0)
+
+
+def draw_goal(key: jax.Array) -> jax.Array:
+    """(3,) goal position on vessel B, m, uniform in its box."""
+    low, high = jnp.asarray(GOAL_LOW_M), jnp.asarray(GOAL_HIGH_M)
+    return jax.random.uniform(key, (3,), minval=low, maxval=high)
+
+
+assert KNOT_STEPS % SUBSTEPS == 0 and math.isclose(KNOT_STEPS * 0.002, 0.1)

@@ -1,0 +1,77 @@
+"""Error statistics of evaluation episodes, as the paper reports them (table 3)."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from mcx_jax.paper import table3
+
+WARM_UP_STEPS = 50
+"""The first second of every episode is dropped (paper)."""
+GROUPS = ("all", "top5", "top1", "max")
+"""Improvements: of the mean over all points, the worst 5 %, the worst 1 %, and of the maximum."""
+
+
+def error_statistics(errors: np.ndarray) -> dict[str, float]:
+    """Mean, std, mean of the worst 5 % and 1 %, and maximum over all points.
+
+    Args:
+        errors: (steps, episodes) after the warm-up, in the unit to report.
+    """
+    points = np.sort(errors.ravel().astype(np.float64))[::-1]
+    top = lambda share: float(points[: max(1, math.ceil(share * points.size))].mean())  # noqa: E731
+    return {
+        "mean": float(points.mean()),
+        "std": float(points.std()),
+        "top5": top(0.05),
+        "top1": top(0.01),
+        "max": float(points[0]),
+    }
+
+
+def improvement(ours: dict[str, float], baseline: dict[str, float]) -> dict[str, float]:
+    """1 - ours / baseline for each of GROUPS."""
+    keys = {"all": "mean", "top5": "top5", "top1": "top1", "max": "max"}
+    return {group: 1.0 - ours[key] / baseline[key] for group, key in keys.items()}
+
+
+def row(
+    who: str, delay: str, sea: str, pos_m: np.ndarray, ang_rad: np.ndarray, valid: np.ndarray
+) -> dict[str, Any]:
+    """One result row of the evaluation's JSON (without the improvement).
+
+    Args:
+        pos_m, ang_rad: (steps, episodes) errors of whole episodes.
+        valid: (episodes,) bool.
+    """
+    return {
+        "who": who,
+        "delay": delay,
+        "sea": sea,
+        "episodes": int(valid.size),
+        "invalid_episodes": int((~valid).sum()),
+        "pos_mm": error_statistics(1e3 * pos_m[WARM_UP_STEPS:]),
+        "ang_mrad": error_statistics(1e3 * ang_rad[WARM_UP_STEPS:]),
+    }
+
+
+def add_improvement(rows: list[dict[str, Any]], baseline: list[dict[str, Any]]) -> None:
+    """Add to each row its improvement over the baseline's row of the same sea."""
+    by_sea = {b["sea"]: b for b in baseline}
+    for r in rows:
+        base = by_sea[r["sea"]]
+        r["improvement"] = {
+            "pos": improvement(r["pos_mm"], base["pos_mm"]),
+            "ang": improvement(r["ang_mrad"], base["ang_mrad"]),
+        }
+
+
+def paper_errors(who: str, delay: str, sea: str) -> tuple[float, float] | None:
+    """The paper's mean (mm, mrad) for a cell: its agents, or the baseline it implies for `ik`."""
+    cell = table3().get((delay, sea))
+    if cell is None:
+        return None
+    if who == "ik":
+        return cell["ik_pos_mm_implied"], cell["ik_ang_mrad_implied"]
+    return cell["pos_mm_mean"], cell["ang_mrad_mean"]
