@@ -114,7 +114,9 @@ def jonswap(omega_rad_s: np.ndarray, sea: SeaState, gamma: float | None = None) 
     return scale * _shape(np.asarray(omega_rad_s) / peak_rad_s, gamma)
 
 
-def spreading_weights(exponent: float | None, directions: int = 25) -> tuple[np.ndarray, np.ndarray]:
+def spreading_weights(
+    exponent: float | None, directions: int = 25
+) -> tuple[np.ndarray, np.ndarray]:
     """Directions and their shares of the wave energy, D(theta) ~ cos^n(theta) on +-90 degrees.
 
     Args:

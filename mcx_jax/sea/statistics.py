@@ -4,11 +4,14 @@ The paper's table 1 lists, per sea state, the mean speed and the mean angular ra
 are the only published figures about its motion data, so the generator is calibrated against them.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from mcx_jax.sea.tables import SEPARATION_X_M, MotionTables
+from mcx_jax.sea.hydro import VesselKnobs, load_hydro, motion_rao
+from mcx_jax.sea.spectrum import SeaState, jonswap, spreading_weights
+from mcx_jax.sea.tables import FROUDE_LAMBDA, SEPARATION_X_M, MotionTables
 
 WANTED_LINEAR_M_S = (0.068, 0.120, 0.155, 0.185)
 """Paper: mean linear speed of the goal, Wa..Wd, laboratory scale."""
@@ -102,3 +105,34 @@ def _pair_speeds(
     relative_rate = np.einsum("nji,nj->ni", rot_a, rate_b) - rate_a
     speed = np.linalg.norm(in_base - np.cross(rate_a, position), axis=1)
     return speed, np.linalg.norm(relative_rate, axis=1)
+
+
+def linear_goal_speed(
+    seas: Sequence[SeaState], knobs: VesselKnobs, samples: int = 6000
+) -> GoalSpeed:
+    """The same means from linear theory, without a table: 10 ms, within 2 % of `goal_speed`.
+
+    The rates of a vessel at an instant are Gaussian with the covariance of the response spectrum;
+    small angles. Fixed samples, so that a search over knobs sees a smooth function.
+    """
+    rng = np.random.default_rng(0)
+    normal = rng.standard_normal((2, samples, 6))
+    arm = rng.uniform([-0.1, -0.1, 0.1], [0.1, 0.1, 0.3], size=(samples, 3)) * [-1, -1, 1]
+    goal = arm + [SEPARATION_X_M, 0.0, 0.0]
+    omega, step = np.arange(0.2, 3.2, 0.02), 0.02
+    theta, weight = spreading_weights(knobs.spreading, 13)
+    raos = [motion_rao(knobs, knobs.heading_deg + angle) for angle in np.degrees(theta)]
+    grid = load_hydro().omega
+    rao = np.array([[np.interp(omega, grid, rao[:, dof]) for dof in range(6)] for rao in raos])
+    rao[:, :3] /= FROUDE_LAMBDA
+    linear, angular = [], []
+    for sea in seas:
+        rate_energy = jonswap(omega, sea, knobs.gamma) * step * omega**2 * FROUDE_LAMBDA
+        covariance = np.einsum("d,dcw,dew,w->ce", weight, rao, rao.conj(), rate_energy).real
+        # Exact head seas leave sway, roll and yaw without variance: keep the factor defined.
+        a, b = normal @ np.linalg.cholesky(covariance + 1e-14 * np.eye(6)).T
+        rate_b = b[:, 3:] * [-1, -1, 1]
+        velocity = b[:, :3] + np.cross(rate_b, arm) - a[:, :3] - np.cross(a[:, 3:], goal)
+        linear.append(np.linalg.norm(velocity, axis=1).mean())
+        angular.append(np.linalg.norm(rate_b - a[:, 3:], axis=1).mean())
+    return GoalSpeed(np.array(linear), np.array(angular))

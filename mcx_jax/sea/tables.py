@@ -15,12 +15,13 @@ from typing import Literal
 
 import numpy as np
 
+from mcx_jax.config import PHYSICS_DT_S
 from mcx_jax.sea.hydro import VesselKnobs, load_hydro, motion_rao
 from mcx_jax.sea.spectrum import GRAVITY_M_S2, SeaState, jonswap, spreading_weights
 
 FROUDE_LAMBDA = 10.0
 KNOT_DT_S = 0.1  # laboratory time; at this spacing cubic Hermite errs by < 3e-6 m, 5e-6 rad
-KNOT_STEPS = 50  # physics steps of 2 ms per knot interval
+KNOT_STEPS = round(KNOT_DT_S / PHYSICS_DT_S)  # 50 physics steps per knot interval
 TABLE_S = 3600.0  # laboratory time, 3.2 h at sea: the usual 3 h sea state
 TABLE_KNOTS = round(TABLE_S / KNOT_DT_S)
 TRAIN_SEEDS = 8
@@ -59,10 +60,9 @@ class MotionTables:
         return (self.knots.shape[1] - 1) * KNOT_DT_S
 
     def last_start(self, steps: int) -> int:
-        """Largest start (in 2 ms steps) of a window of `steps` steps: draw from 0 to this, inclusive.
+        """Largest start, in physics steps, of a window of `steps`: draw from 0 to this, inclusive.
 
-        At that start the window's end falls on the end of the table, whose last interval the sampler
-        evaluates at its right edge only by reading row i + 1 = the last row: hence the minus one.
+        Minus one, because the very last instant of a table has no row i + 1.
         """
         return (self.knots.shape[1] - 1) * KNOT_STEPS - 1 - steps
 
@@ -142,9 +142,7 @@ def inverse_fft(components: np.ndarray) -> np.ndarray:
     return np.fft.irfft(spectrum, n=TABLE_KNOTS, axis=1)
 
 
-def synthesise(
-    sea: SeaState, seed: int, knobs: VesselKnobs, companion: bool = False
-) -> np.ndarray:
+def synthesise(sea: SeaState, seed: int, knobs: VesselKnobs, companion: bool = False) -> np.ndarray:
     """One hour of motion: (TABLE_KNOTS + 1, 12) float32, periodic, columns of `MotionTables`."""
     waves = wave_amplitudes(sea, seed, knobs)
     motion = np.einsum("dn,dcn->cn", waves, _responses(knobs, companion))
@@ -170,7 +168,9 @@ def build_tables(
         seas: sea states.
         role: "train" or "test"; their waves never share a seed, or an instant.
         knobs: the vessel; None = the calibrated defaults.
-        coupled: give vessel B the same waves instead of an independent window.
+        coupled: give vessel B the same waves instead of an independent window. Each vessel answers
+            as if alone: no shelter, no interaction, although at the task's separation of 6.5 m
+            full scale the two hulls would overlap.
         split: "seeds": 8 hours per sea to train on and another one to test on. "paper": one hour,
             the first 2/3 trains, the last 1/3 tests, 20 s cut at both borders of the test part.
         seeds_per_sea: other than the usual number of hours (split "seeds" only).

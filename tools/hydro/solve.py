@@ -10,6 +10,13 @@ Conventions: x forward, y to port, z up, origin amidships on the waterline; e^{-
 direction the waves run TO (180 deg = head sea); unit wave amplitude; infinite depth; full scale SI.
 The file holds the hydrodynamics only. Damping, heading and the other choices that turn it into
 motion are `VesselKnobs` of `mcx_jax/sea/hydro.py`.
+
+Checks, printed and stored in the file's meta (702 hull and 360 lid panels, 37 s on one core):
+- the energy (Haskind) relation of damping and wave force holds within 5.4 % in all six motions from
+  0.4 to 2 rad/s, with a 10 deg trapezoid;
+- head seas at 0.8, 1.0, 1.2, 1.4 rad/s, heave .93 .84 .68 .50 m/m and pitch over wave slope
+  .95 .88 .79 .64: within .024 of an earlier, separately meshed model of the same hull
+  (.93 .84 .69 .52 and .95 .89 .81 .66); at 0.2 rad/s 1.00 and .98, in the limit 1 and 1.
 """
 
 import argparse
@@ -69,7 +76,7 @@ def hydrostatics(hull: Hull, body: cpt.FloatingBody) -> tuple[np.ndarray, np.nda
 
 
 def solve(body: cpt.FloatingBody) -> dict[str, np.ndarray]:
-    """Added mass, radiation damping (w, 6, 6) and wave force per metre of amplitude (w, heading, 6)."""
+    """Added mass, radiation damping (w, 6, 6) and wave force per metre (w, heading, 6)."""
     problems = xr.Dataset(
         coords={
             "omega": OMEGA,
@@ -90,6 +97,29 @@ def solve(body: cpt.FloatingBody) -> dict[str, np.ndarray]:
         "B": result["radiation_damping"].sel(square).squeeze().transpose(*axes).values,
         "F": force.transpose("omega", "wave_direction", "influenced_dof").values,
     }
+
+
+def symmetric(data: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], float]:
+    """Without the rounding noise that couples symmetric to antisymmetric motion; and its size.
+
+    The hull is its own mirror image, so surge, heave, pitch and sway, roll, yaw do not mix, and
+    waves from right ahead or astern push only the former. Capytaine meets this to single precision.
+
+    Returns:
+        the cleaned arrays, and the largest entry removed relative to the dof's own scale.
+    """
+    odd = np.array([False, True, False, True, False, True])
+    mixed = odd[:, None] ^ odd[None, :]
+    size = np.sqrt(np.abs(np.diagonal(data["M"] + data["A"], axis1=1, axis2=2)).max(axis=0))
+    noise = max(
+        float((np.abs(data[key]) / np.outer(size, size))[..., mixed].max())
+        for key in ("A", "B", "M")
+    )
+    clean = {key: np.where(mixed, 0.0, data[key]) for key in ("A", "B", "M", "C")}
+    clean["F"] = data["F"].copy()
+    for end in (0, -1):
+        clean["F"][:, end, odd] = 0.0
+    return clean, noise
 
 
 def haskind_ratio(data: dict[str, np.ndarray]) -> np.ndarray:
@@ -132,6 +162,7 @@ def main() -> None:
     # Capytaine skips a failed problem with a warning and leaves NaN.
     if not all(np.isfinite(array).all() for array in data.values()):
         raise SystemExit("some problems were not solved: see Capytaine's warnings above")
+    data, noise = symmetric(data)
     seconds = time.time() - started
     haskind = haskind_ratio(data)[(OMEGA > 0.39) & (OMEGA < 2.01)]
     raos = {
@@ -162,6 +193,7 @@ def main() -> None:
         "date": datetime.date.today().isoformat(),
         "licence": "made for this repository, under the repository's licence",
         "knobs": "not here: damping, heading, base point are VesselKnobs in mcx_jax/sea/hydro.py",
+        "port_starboard_noise_removed": noise,
         "check_haskind_ratio_0.4_to_2_rad_s": {
             dof: [round(float(haskind[:, j].min()), 3), round(float(haskind[:, j].max()), 3)]
             for j, dof in enumerate(DOFS)

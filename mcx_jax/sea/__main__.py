@@ -1,0 +1,77 @@
+"""`python -m mcx_jax.sea`: motion statistics of the generator beside the paper's table 1."""
+
+import argparse
+import json
+import math
+import pathlib
+import sys
+
+from mcx_jax.errors import UserError
+from mcx_jax.sea.spectrum import SEAS
+from mcx_jax.sea.statistics import (
+    WANTED_ANGULAR_RAD_S,
+    WANTED_LINEAR_M_S,
+    GoalSpeed,
+    goal_speed,
+)
+from mcx_jax.sea.tables import build_tables
+
+
+def report(speed: GoalSpeed) -> dict:
+    """The figures as plain numbers, in the order Wa..Wd."""
+    errors = speed.log_errors()
+    return {
+        "seas": list(SEAS),
+        "linear_m_s": speed.linear_m_s.tolist(),
+        "linear_wanted_m_s": list(WANTED_LINEAR_M_S),
+        "angular_rad_s": speed.angular_rad_s.tolist(),
+        "angular_wanted_rad_s": list(WANTED_ANGULAR_RAD_S),
+        "worst_ratio": math.exp(abs(errors).max()),
+        "rms_log_error": math.sqrt((errors**2).mean()),
+    }
+
+
+def lines(figures: dict) -> list[str]:
+    """The table as text."""
+    text = ["goal as seen from the arm's base | " + " | ".join(f"{s:>6}" for s in figures["seas"])]
+    for label, here, wanted in (
+        ("mean linear speed, m/s", "linear_m_s", "linear_wanted_m_s"),
+        ("mean angular rate, rad/s", "angular_rad_s", "angular_wanted_rad_s"),
+    ):
+        ratio = [a / b for a, b in zip(figures[here], figures[wanted], strict=True)]
+        for name, row in ((label, figures[here]), ("  paper", figures[wanted]), ("  ratio", ratio)):
+            text.append(f"{name:<32} | " + " | ".join(f"{value:6.3f}" for value in row))
+    text.append(
+        f"worst cell: factor {figures['worst_ratio']:.3f}; "
+        f"rms log error {figures['rms_log_error']:.3f}"
+    )
+    return text
+
+
+def main() -> int:
+    """Print the statistics of the chosen calibration; 8 hours of motion per sea state."""
+    parser = argparse.ArgumentParser(prog="python -m mcx_jax.sea", description=main.__doc__)
+    parser.add_argument("--json", type=pathlib.Path, help="also write the figures to this file")
+    args = parser.parse_args()
+    try:
+        figures = report(goal_speed(build_tables(list(SEAS.values()), "train")))
+        print("\n".join(lines(figures)))
+        if args.json:
+            _write(args.json, figures)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _write(path: pathlib.Path, figures: dict) -> None:
+    try:
+        path.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise UserError(
+            f"--json {path}: cannot be written ({error.strerror}); choose a writable file"
+        ) from None
+
+
+if __name__ == "__main__":
+    sys.exit(main())

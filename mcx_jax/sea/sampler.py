@@ -1,0 +1,96 @@
+"""Vessel motion at an instant, in JAX, for ONE environment (vmapped elsewhere, batch axis last).
+
+Time is an int32 count of 2 ms physics steps, never float32 seconds: those resolve 0.2 ms after an
+hour, which alone would put 0.06 m/s of noise on a finite-difference velocity. Small vectors are
+written as scalar expressions, so that under `vmap` each scalar is one contiguous row.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from mcx_jax.config import PHYSICS_DT_S
+from mcx_jax.sea.tables import KNOT_DT_S, KNOT_STEPS
+
+__all__ = ["KNOT_STEPS", "PHYSICS_DT_S", "body_rates", "hermite", "rotation_rpy", "segment_rows"]
+
+
+def segment_rows(
+    knots: jax.Array, table: jax.Array, step: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The two knots around an instant.
+
+    Args:
+        knots: (tables, rows, 12), see `mcx_jax.sea.tables.MotionTables`.
+        table: () int32.
+        step: () int32, physics steps of 2 ms since the table's start, 0 <= step < 50 (rows - 1).
+
+    Returns:
+        row0, row1: (12,) each; the instant lies `step % KNOT_STEPS` physics steps after row0.
+    """
+    index = step // KNOT_STEPS
+    return knots[table, index], knots[table, index + 1]
+
+
+def hermite(
+    row0: jax.Array, row1: jax.Array, step_in_segment: jax.Array | int
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Cubic Hermite interpolation between two knots 0.1 s apart.
+
+    Position and velocity are continuous over knots, the acceleration jumps there by up to
+    0.01 m/s2 (0.5 % rms).
+
+    Args:
+        row0, row1: (12,) values, then time derivatives.
+        step_in_segment: () integer physics steps after row0, 0..50, may be traced.
+
+    Returns:
+        x, xdot, xddot: (6,) each; x, y, z m, roll, pitch, yaw rad, per s, per s2.
+    """
+    u = jnp.asarray(step_in_segment).astype(row0.dtype) / KNOT_STEPS
+    x, xd, xdd = [], [], []
+    for i in range(6):
+        x0, slope0, slope1 = row0[i], KNOT_DT_S * row0[i + 6], KNOT_DT_S * row1[i + 6]
+        rise = row1[i] - x0
+        # x = x0 + slope0 u + c2 u^2 + c3 u^3. Differences first: float32 keeps 2e-5 m/s2.
+        c2 = 3.0 * rise - 2.0 * slope0 - slope1
+        c3 = slope0 + slope1 - 2.0 * rise
+        x.append(x0 + u * (slope0 + u * (c2 + u * c3)))
+        xd.append((slope0 + u * (2.0 * c2 + u * (3.0 * c3))) / KNOT_DT_S)
+        xdd.append((2.0 * c2 + u * (6.0 * c3)) / KNOT_DT_S**2)
+    return jnp.stack(x), jnp.stack(xd), jnp.stack(xdd)
+
+
+def rotation_rpy(rpy: jax.Array) -> jax.Array:
+    """Rz(yaw) Ry(pitch) Rx(roll): (3,) rad -> (3, 3), body axes to parent axes."""
+    sr, sp, sy = jnp.sin(rpy[0]), jnp.sin(rpy[1]), jnp.sin(rpy[2])
+    cr, cp, cy = jnp.cos(rpy[0]), jnp.cos(rpy[1]), jnp.cos(rpy[2])
+    rows = (
+        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+        (-sp, cp * sr, cp * cr),
+    )
+    return jnp.stack([jnp.stack(row) for row in rows])
+
+
+def body_rates(
+    rpy: jax.Array, rpy_dot: jax.Array, rpy_ddot: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Angular velocity and acceleration in body axes, for R = Rz(yaw) Ry(pitch) Rx(roll).
+
+    Args:
+        rpy, rpy_dot, rpy_ddot: (3,) roll, pitch, yaw in rad, per s, per s2.
+
+    Returns:
+        w_body (3,) rad/s, al_body (3,) rad/s2: the time derivative of w_body, which is also the
+        angular acceleration in the parent frame seen in body axes, since w x w = 0.
+    """
+    sr, cr, sp, cp = jnp.sin(rpy[0]), jnp.cos(rpy[0]), jnp.sin(rpy[1]), jnp.cos(rpy[1])
+    dr, dp, dy = rpy_dot[0], rpy_dot[1], rpy_dot[2]
+    ddr, ddp, ddy = rpy_ddot[0], rpy_ddot[1], rpy_ddot[2]
+    w = (dr - dy * sp, dp * cr + dy * cp * sr, dy * cp * cr - dp * sr)
+    al = (
+        ddr - ddy * sp - dy * dp * cp,
+        ddp * cr + ddy * cp * sr + dr * w[2] - dy * dp * sp * sr,
+        ddy * cp * cr - ddp * sr - dr * w[1] - dy * dp * sp * cr,
+    )
+    return jnp.stack(w), jnp.stack(al)
