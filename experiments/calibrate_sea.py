@@ -1,7 +1,7 @@
 """How the defaults of `VesselKnobs` were found: `python experiments/calibrate_sea.py`.
 
 Prints linear-theory ratios to the paper's eight means (linear Wa..Wd | angular Wa..Wd) around the
-defaults, then the best sets of a grid of round values. 40 s on one core.
+defaults, then the best sets of a grid of round values. 20 s on one core.
 """
 
 import argparse

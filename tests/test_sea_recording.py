@@ -92,7 +92,7 @@ def test_lowest_rate_is_accepted(tmp_path):
 
 def test_constant_offsets_go_but_list_and_trim_stay(tmp_path):
     data = record()
-    data[:, 1:] += [100.0, -50.0, 3.0, 0.04, -0.02, 3.1]
+    data[:, 1:] += [100.0, -50.0, 3.0, 0.04, -0.02, np.pi]
     data[:, 6] = (data[:, 6] + np.pi) % (2 * np.pi) - np.pi  # a compass that jumps at 180 deg
     tables = load_recording(save(tmp_path / "r.npy", data))
     mean = tables.knots[0, :, :6].mean(axis=0)
