@@ -1,0 +1,167 @@
+"""Collecting experience. The one `vmap` over environments is here, with the batch axis LAST.
+
+Physics is fast on (joint, environment) rows, networks on (environment, feature) rows; observations
+and actions are transposed where the two meet. Environment states and the networks' memories live
+on from window to window.
+
+Resets are staggered. An episode has E steps, a window T, so G = E / T windows make an episode and
+the environments form G blocks. At the START of window i the block i mod G is reset and nothing is
+reset inside a window: no step pays for a reset, no `cond` runs two branches under `vmap`, and all
+phases of an episode are in every window. A window's end is a truncation, not an end: the value of
+the last observation follows. Where G does not divide N, or N < G, neighbouring blocks share an
+environment, which is then reset earlier than need be: a shorter episode, otherwise harmless.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from mcx_jax.ppo.gaussian import action_distribution
+from mcx_jax.ppo.networks import Carry, Networks, Params, init_carry, step
+from mcx_jax.ppo.normalise import RunningStats, normalise_obs
+
+
+@struct.dataclass
+class Actors:
+    """Everything of the environments that lives on from one window to the next.
+
+    Attributes:
+        env_state: states of N environments, leaves (..., N).
+        policy_carry: the policy's memory, leaves (N, H).
+        value_carry: the value network's memory, leaves (N, H).
+    """
+
+    env_state: Any
+    policy_carry: Carry
+    value_carry: Carry
+
+
+@struct.dataclass
+class Transition:
+    """One control step of every environment; stacked, time comes first.
+
+    Attributes:
+        obs: what the policy saw, not normalised, (N, F).
+        action: sampled, centimetres and centiradians, (N, A).
+        log_prob: of the action, (N,).
+        reward: of the step, (N,).
+        metrics: the environment's own after the step, leaves (N,).
+    """
+
+    obs: jax.Array
+    action: jax.Array
+    log_prob: jax.Array
+    reward: jax.Array
+    metrics: Any
+
+
+@struct.dataclass
+class Window:
+    """T steps of N environments.
+
+    Attributes:
+        steps: leaves (T, N, ...).
+        policy_carry: the policy's memory BEFORE the first step of each of the T / L sequences,
+            leaves (T / L, N, H).
+        last_obs: after the last step, not normalised, (N, F).
+    """
+
+    steps: Transition
+    policy_carry: Carry
+    last_obs: jax.Array
+
+
+def reset_all(env: Any, key: jax.Array, num_envs: int) -> Any:
+    """States of `num_envs` environments at the start of an episode, leaves (..., N)."""
+    return jax.vmap(env.reset, out_axes=-1)(jax.random.split(key, num_envs))
+
+
+def step_all(env: Any, env_state: Any, action: jax.Array) -> Any:
+    """One control step of all: leaves (..., N), action (N, A)."""
+    return jax.vmap(env.step, in_axes=(-1, -1), out_axes=-1)(env_state, action.T)
+
+
+def init_actors(env: Any, nets: Networks, key: jax.Array, num_envs: int) -> Actors:
+    """All environments reset, all memories empty."""
+    return Actors(
+        env_state=reset_all(env, key, num_envs),
+        policy_carry=init_carry(nets.policy, (num_envs,)),
+        value_carry=init_carry(nets.value, (num_envs,)),
+    )
+
+
+def reset_block(
+    env: Any, actors: Actors, key: jax.Array, iteration: jax.Array, groups: int
+) -> Actors:
+    """Reset one of `groups` blocks of environments and empty its memories.
+
+    Args:
+        actors: of N environments.
+        iteration: number of the window, (); block iteration mod groups is reset.
+        groups: G, windows in an episode.
+    """
+    num_envs = actors.env_state.obs.shape[-1]
+    size = -(-num_envs // groups)
+    start = (iteration % groups) * num_envs // groups
+    fresh = reset_all(env, key, size)
+
+    def last(old: jax.Array, new: jax.Array) -> jax.Array:
+        return jax.lax.dynamic_update_slice_in_dim(old, new, start, axis=old.ndim - 1)
+
+    def empty(old: jax.Array) -> jax.Array:
+        zeros = jnp.zeros((size, *old.shape[1:]), old.dtype)
+        return jax.lax.dynamic_update_slice_in_dim(old, zeros, start, axis=0)
+
+    return Actors(
+        env_state=jax.tree.map(last, actors.env_state, fresh),
+        policy_carry=jax.tree.map(empty, actors.policy_carry),
+        value_carry=jax.tree.map(empty, actors.value_carry),
+    )
+
+
+def act(
+    nets: Networks, params: Params, stats: RunningStats, actors: Actors, key: jax.Array
+) -> tuple[Carry, Transition]:
+    """Sample one action for every environment; reward and metrics are still those before it."""
+    obs = actors.env_state.obs.T
+    carry, mean, sigma = step(nets.policy, params, actors.policy_carry, normalise_obs(stats, obs))
+    action, log_prob = action_distribution(mean, sigma).sample_and_log_prob(seed=key)
+    before = actors.env_state
+    return carry, Transition(obs, action, log_prob, before.reward, before.metrics)
+
+
+def collect(
+    env: Any,
+    nets: Networks,
+    params: Params,
+    stats: RunningStats,
+    actors: Actors,
+    keys: jax.Array,
+) -> tuple[Actors, Window]:
+    """Run the policy for K x L steps.
+
+    Args:
+        params: the policy's weights.
+        stats: of the observations; frozen meanwhile.
+        keys: one for each step, (K, L): K sequences of L steps.
+
+    Returns:
+        The actors after the window (the value network's memory untouched), and the window.
+    """
+
+    def one_step(actors: Actors, key: jax.Array) -> tuple[Actors, Transition]:
+        carry, transition = act(nets, params, stats, actors, key)
+        env_state = step_all(env, actors.env_state, transition.action)
+        transition = transition.replace(reward=env_state.reward, metrics=env_state.metrics)
+        return actors.replace(env_state=env_state, policy_carry=carry), transition
+
+    def one_sequence(actors: Actors, keys: jax.Array):
+        first = actors.policy_carry
+        actors, transitions = jax.lax.scan(one_step, actors, keys)
+        return actors, (first, transitions)
+
+    actors, (carries, steps) = jax.lax.scan(one_sequence, actors, keys)
+    steps = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), steps)
+    return actors, Window(steps=steps, policy_carry=carries, last_obs=actors.env_state.obs.T)
