@@ -23,8 +23,9 @@ def xla_flags_for(jaxlib_version: str, current: str) -> str:
         jaxlib_version: e.g. "0.10.2".
         current: the present value of XLA_FLAGS ("" if unset).
     """
-    release = tuple(int("".join(c for c in part if c.isdigit()) or 0)
-                    for part in jaxlib_version.split(".")[:3])
+    release = tuple(
+        int("".join(c for c in part if c.isdigit()) or 0) for part in jaxlib_version.split(".")[:3]
+    )
     if FUSION_FLAG in current or not (0, 8, 0) <= release <= (0, 11, 1):
         return current
     return f"{current} {FUSION_FLAG}=false".strip()

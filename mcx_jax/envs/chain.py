@@ -88,9 +88,7 @@ def _project(model: ChainModel, rotations: list[Mat], wrenches: list) -> list[Sc
         torques[i] = moment[2]
         if i:
             force_up = matvec(rotations[i], force)
-            moment_up = vadd(
-                matvec(rotations[i], moment), cross(model.links[i].position, force_up)
-            )
+            moment_up = vadd(matvec(rotations[i], moment), cross(model.links[i].position, force_up))
             force = vadd(wrenches[i - 1][0], force_up)
             moment = vadd(wrenches[i - 1][1], moment_up)
     return torques

@@ -51,7 +51,9 @@ def init(delay: Delay, first: jax.Array) -> LagState:
         for gain in [(b0 + b1 + b2) / (1.0 + a1 + a2)]
     ]
     # Sections other than the first see the previous section's output: scale by the gain so far.
-    gains = np.cumprod([1.0] + [(s[0] + s[1] + s[2]) / (1.0 + s[3] + s[4]) for s in sections(delay)])
+    gains = np.cumprod(
+        [1.0] + [(s[0] + s[1] + s[2]) / (1.0 + s[3] + s[4]) for s in sections(delay)]
+    )
     scaled = [g * s for g, s in zip(gains, state, strict=False)]
     return LagState(
         queue=jnp.broadcast_to(first, (delay.steps, *first.shape)),

@@ -119,7 +119,9 @@ def chain_model(mj: mujoco.MjModel, tool_site: str | None = None) -> ChainModel:
         site_position=_vec(position),
         timestep_s=float(mj.opt.timestep),
         integrator={0: "euler", 3: "implicitfast"}[int(mj.opt.integrator)],
-        gravity=ZERO if mj.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY else _vec(mj.opt.gravity),
+        gravity=ZERO
+        if mj.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
+        else _vec(mj.opt.gravity),
     )
 
 
@@ -139,7 +141,11 @@ def refuse_unsupported(mj: mujoco.MjModel) -> None:
     joint_actuators = bool(np.all(mj.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT))
     fixed_gain = bool(np.all(mj.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED))
     plain_bias = bool(
-        np.all(np.isin(mj.actuator_biastype, [mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE]))
+        np.all(
+            np.isin(
+                mj.actuator_biastype, [mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE]
+            )
+        )
     )
     faults = {
         "no joints": mj.njnt == 0,
@@ -147,8 +153,8 @@ def refuse_unsupported(mj: mujoco.MjModel) -> None:
         "more than one joint on a body": len(set(mj.jnt_bodyid.tolist())) < mj.njnt,
         "a branching (not serial) tree": not serial
         or sum(_moving_ancestor(mj, int(b)) == 0 for b in mj.jnt_bodyid) > 1,
-        "contacts (disable them with <flag contact=\"disable\"/>)": contacts and collidable,
-        "active joint limits (disable them with <flag limit=\"disable\"/>)": limits
+        'contacts (disable them with <flag contact="disable"/>)': contacts and collidable,
+        'active joint limits (disable them with <flag limit="disable"/>)': limits
         and bool(np.any(mj.jnt_limited)),
         "equality constraints": constraints and mj.neq > 0,
         "dry joint friction (frictionloss)": constraints and bool(np.any(mj.dof_frictionloss)),
@@ -165,7 +171,9 @@ def refuse_unsupported(mj: mujoco.MjModel) -> None:
         "mocap bodies": mj.nmocap > 0,
         "actuators that do not act on a joint": not joint_actuators,
         "actuators with internal dynamics": mj.na > 0,
-        "actuators with a gain or bias that is not constant/affine": not (fixed_gain and plain_bias),
+        "actuators with a gain or bias that is not constant/affine": not (
+            fixed_gain and plain_bias
+        ),
         "an integrator other than Euler or implicitfast": int(mj.opt.integrator) not in (0, 3),
     }
     for fault, present in faults.items():
@@ -223,9 +231,7 @@ def _relative(a, b):
 def _link(mj, joint: int, bodies: list[int], frames: list, world: list) -> Link:
     here = _compose(world[bodies[joint]], frames[joint])
     parent = (
-        _compose(world[bodies[joint - 1]], frames[joint - 1])
-        if joint
-        else (np.eye(3), np.zeros(3))
+        _compose(world[bodies[joint - 1]], frames[joint - 1]) if joint else (np.eye(3), np.zeros(3))
     )
     rotation, position = _relative(parent, here)
     mass, moment, inertia = _mass_properties(mj, bodies[joint], here, world)
@@ -237,7 +243,9 @@ def _link(mj, joint: int, bodies: list[int], frames: list, world: list) -> Link:
         position=_vec(position),
         mass=mass,
         moment=_vec(moment),
-        inertia=tuple(snap(inertia[i, j]) for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))),  # type: ignore[arg-type]
+        inertia=tuple(
+            snap(inertia[i, j]) for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+        ),  # type: ignore[arg-type]
         armature=float(mj.dof_armature[dof]),
         damping=float(np.ravel(mj.dof_damping[dof])[0]),
         q_ref=float(mj.qpos0[mj.jnt_qposadr[joint]]),
@@ -266,7 +274,9 @@ def _site(mj, name: str | None, last_body: int, frame, world):
     site = mujoco.mj_name2id(mj, mujoco.mjtObj.mjOBJ_SITE, name)
     if site < 0:
         names = [mj.site(i).name for i in range(mj.nsite)]
-        raise UserError(f"--tool-site {name}: the arm model's sites are: {', '.join(names) or 'none'}")
+        raise UserError(
+            f"--tool-site {name}: the arm model's sites are: {', '.join(names) or 'none'}"
+        )
     body = int(mj.site_bodyid[site])
     if body != last_body and _moving_ancestor(mj, body) != last_body:
         raise UserError(f"--tool-site {name}: it must be on the last link of the chain")

@@ -1,8 +1,9 @@
 """Which motion an episode uses: tables on the device, and random windows drawn from them."""
 
+from typing import Literal
+
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 
 from mcx_jax.config import CONTROL_DT_S, SUBSTEPS, MotionConfig
@@ -63,7 +64,9 @@ def draw_track(motion: Motion, key: jax.Array, sea: jax.Array | int | None = Non
     return Track(table=table, start_a=start_a, start_b=start_a if motion.coupled else start_b)
 
 
-def load_motion(config: MotionConfig, episode_steps: int, split: str) -> Motion:
+def load_motion(
+    config: MotionConfig, episode_steps: int, split: Literal["train", "test"]
+) -> Motion:
     """Tables for training ("train") or evaluation ("test"), generated or from a recording.
 
     Raises:
@@ -71,7 +74,7 @@ def load_motion(config: MotionConfig, episode_steps: int, split: str) -> Motion:
     """
     needed_steps = episode_steps + LOOK_AHEAD_STEPS
     if config.motion:
-        names, knots_a, knots_b = _recorded(config, needed_steps * CONTROL_DT_S, split)
+        names, knots_a, knots_b = _recorded(config, split)
     else:
         names, knots_a, knots_b = _generated(config, split)
     last_start = (knots_a.shape[1] - 1) * KNOT_STEPS // SUBSTEPS - needed_steps - 1
@@ -92,25 +95,24 @@ def load_motion(config: MotionConfig, episode_steps: int, split: str) -> Motion:
     )
 
 
-def _generated(config: MotionConfig, split: str):
+def _generated(config: MotionConfig, split: Literal["train", "test"]):
     from mcx_jax.sea.spectrum import parse_sea
     from mcx_jax.sea.tables import build_tables
 
     names = NAMED_SEAS if config.sea == "all" else (config.sea,)
-    tables = build_tables(
-        [parse_sea(name) for name in names], split, coupled=config.coupled, split=config.split  # type: ignore[arg-type]
-    )
+    seas = [parse_sea(name) for name in names]
+    tables = build_tables(seas, split, coupled=config.coupled, split=config.split)
     return tables.sea_names, tables.knots, tables.companion
 
 
-def _recorded(config: MotionConfig, needed_s: float, split: str):
+def _recorded(config: MotionConfig, split: Literal["train", "test"]):
     from mcx_jax.sea.recording import load_recording, split_recording
 
-    knots = load_recording(
+    tables = load_recording(
         config.motion,
         length_unit=config.motion_length_unit,
         angle_unit=config.motion_angle_unit,
         scale=config.motion_scale,
     )
-    part = split_recording(knots, split)
-    return ("motion",), np.asarray(part)[None], None
+    train, test = split_recording(tables)
+    return ("motion",), (train if split == "train" else test).knots, None

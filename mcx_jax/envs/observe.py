@@ -47,7 +47,9 @@ def tracking_error(goal: tuple[Mat, Vec], tool: tuple[Mat, Vec]) -> tuple[Scalar
     return norm(vsub(goal[1], tool[1])), angle(matmul(transpose(goal[0]), tool[0]))
 
 
-def observe(goal: tuple[Mat, Vec], tool: tuple[Mat, Vec], errors: tuple[Scalar, Scalar]) -> jax.Array:
+def observe(
+    goal: tuple[Mat, Vec], tool: tuple[Mat, Vec], errors: tuple[Scalar, Scalar]
+) -> jax.Array:
     """(38,) observation in the order of OBS_TABLE.
 
     Args:

@@ -194,9 +194,7 @@ class V2VEnv:
         # The engines advance a base at physics step i by the deck's motion at that instant.
         base_at = lambda i: vessels.base_state(seg_a, i)  # noqa: E731
         if self.mjx_model is None:
-            q, qd = chain.substeps(
-                self.model, self.integrator, arm.q, arm.qd, ctrl, base_at, count
-            )
+            q, qd = chain.substeps(self.model, self.integrator, arm.q, arm.qd, ctrl, base_at, count)
         else:
             from mcx_jax.envs import mjx_engine
 
@@ -214,9 +212,7 @@ def correct(goal: tuple[Mat, Vec], action: jax.Array) -> tuple[Mat, Vec]:
 
 def command(model: ChainModel, reference: jax.Array, rate: jax.Array) -> jax.Array:
     """(nu,) actuator commands: position servos get the joint reference, velocity servos its rate."""
-    return jnp.stack(
-        [(reference if act.bias[1] else rate)[act.joint] for act in model.actuators]
-    )
+    return jnp.stack([(reference if act.bias[1] else rate)[act.joint] for act in model.actuators])
 
 
 def _goal(state: EnvState) -> tuple[Mat, Vec]:

@@ -13,17 +13,16 @@ from flax import struct
 
 from mcx_jax.config import SUBSTEPS
 from mcx_jax.envs.motion import Motion, Track
-from mcx_jax.sea.sampler import KNOT_STEPS, hermite, segment_rows
+from mcx_jax.sea.sampler import KNOT_STEPS, body_rates, hermite, segment_rows
 from mcx_jax.spatial import (
     Mat,
-    Scalar,
     Vec,
-    cross,
     matmul,
     matvec,
     rotation_rpy,
     tmatvec,
     transpose,
+    unpack,
     vadd,
     vsub,
 )
@@ -73,26 +72,14 @@ def still(seg: Segment) -> Segment:
 def base_state(seg: Segment, i: jax.Array | int) -> tuple[Vec, Vec, Vec]:
     """Vessel A's (w, al, a) in its own axes at physics step i, as `chain.BaseState`."""
     x, xd, xdd = seg.at(i)
-    roll, pitch, yaw = x[3], x[4], x[5]
-    rotation = rotation_rpy(roll, pitch, yaw)
-    w, al = _body_rates(roll, pitch, xd, xdd)
-    return w, al, tmatvec(rotation, (xdd[0], xdd[1], xdd[2] + GRAVITY_M_S2))
+    rotation = rotation_rpy(x[3], x[4], x[5])
+    w, al = body_rates(x[3:], xd[3:], xdd[3:])
+    return unpack(w, 3), unpack(al, 3), tmatvec(rotation, (xdd[0], xdd[1], xdd[2] + GRAVITY_M_S2))
 
 
-def _body_rates(roll: Scalar, pitch: Scalar, xd: jax.Array, xdd: jax.Array) -> tuple[Vec, Vec]:
-    """Angular velocity and acceleration in body axes from Euler angle rates (rpy, R = Rz Ry Rx)."""
-    (dr, dp, dy), (ddr, ddp, ddy) = (xd[3], xd[4], xd[5]), (xdd[3], xdd[4], xdd[5])
-    cr, sr, cp, sp = jnp.cos(roll), jnp.sin(roll), jnp.cos(pitch), jnp.sin(pitch)
-    w = (dr - dy * sp, dp * cr + dy * cp * sr, -dp * sr + dy * cp * cr)
-    al = (
-        ddr - ddy * sp - dy * dp * cp,
-        ddp * cr - dp * dr * sr + ddy * cp * sr - dy * dp * sp * sr + dy * dr * cp * cr,
-        -ddp * sr - dp * dr * cr + ddy * cp * cr - dy * dp * sp * cr - dy * dr * cp * sr,
-    )
-    return w, al
-
-
-def goal_in_base(seg_a: Segment, seg_b: Segment, goal_m: Vec, i: int | jax.Array) -> tuple[Mat, Vec]:
+def goal_in_base(
+    seg_a: Segment, seg_b: Segment, goal_m: Vec, i: int | jax.Array
+) -> tuple[Mat, Vec]:
     """T_G^B = (R_B_G, p_B_G): the goal as seen from the arm's base at physics step i.
 
     Args:
