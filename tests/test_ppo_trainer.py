@@ -73,7 +73,7 @@ def test_traced_once():
 def test_value_of_a_constant_reward():
     # 0.5 a step for ever at gamma 0.9 is worth 5.
     env = make_probe(constant_reward=0.5, scale=0.0)
-    state, rows = _train(env, 60)
+    state, _ = _train(env, 60)
     stats = state.value_stats
     _, value = step(
         trainer.networks_of(CONFIG.ppo, env.action_size).value,

@@ -1,5 +1,7 @@
 """From a collected window to what the updates read: masks, values, advantages, sequences."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -105,8 +107,10 @@ def judge(
         policy_carry=None,
         value_carry=None,
     )
-    batch = to_sequences(per_step, config.sequence_steps).replace(
-        policy_carry=flatten_starts(window.policy_carry), value_carry=flatten_starts(carries)
+    batch = replace(
+        to_sequences(per_step, config.sequence_steps),
+        policy_carry=flatten_starts(window.policy_carry),
+        value_carry=flatten_starts(carries),
     )
     return Judged(
         batch=batch,

@@ -133,11 +133,11 @@ def init_params(net: "PolicyNet | ValueNet", key: jax.Array, obs_size: int) -> P
     return net.init(key, carry, jnp.zeros((obs_size,)), method="step")
 
 
-def step(net: nn.Module, params: Params, carry: Carry, obs: jax.Array):
+def step(net: nn.Module, params: Params, carry: Carry, obs: jax.Array) -> Any:
     """`net.step` with `params`."""
     return net.apply(params, carry, obs, method="step")
 
 
-def unroll(net: nn.Module, params: Params, carry: Carry, obs: jax.Array):
+def unroll(net: nn.Module, params: Params, carry: Carry, obs: jax.Array) -> Any:
     """`net.unroll` with `params`."""
     return net.apply(params, carry, obs, method="unroll")

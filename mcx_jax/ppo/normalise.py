@@ -1,5 +1,7 @@
 """Running mean and standard deviation, for observations and for value targets."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -62,7 +64,7 @@ def merge(stats: RunningStats, x: jax.Array, mask: jax.Array, keep: float = 1.0)
         mask: (*batch,), 1 for samples that count.
         keep: weight of all earlier samples; below 1 they are forgotten.
     """
-    stats = stats.replace(count=keep * stats.count)
+    stats = replace(stats, count=keep * stats.count)
     axes = tuple(range(mask.ndim))
     weight = mask.reshape(mask.shape + (1,) * (x.ndim - mask.ndim))
     batch_count = jnp.sum(mask)

@@ -12,6 +12,7 @@ the last observation follows. Where G does not divide N, or N < G, neighbouring 
 environment, which is then reset earlier than need be: a shorter episode, otherwise harmless.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -154,8 +155,8 @@ def collect(
     def one_step(actors: Actors, key: jax.Array) -> tuple[Actors, Transition]:
         carry, transition = act(nets, params, stats, actors, key)
         env_state = step_all(env, actors.env_state, transition.action)
-        transition = transition.replace(reward=env_state.reward, metrics=env_state.metrics)
-        return actors.replace(env_state=env_state, policy_carry=carry), transition
+        transition = replace(transition, reward=env_state.reward, metrics=env_state.metrics)
+        return replace(actors, env_state=env_state, policy_carry=carry), transition
 
     def one_sequence(actors: Actors, keys: jax.Array):
         first = actors.policy_carry

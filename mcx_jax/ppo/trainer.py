@@ -7,6 +7,7 @@
 Several seeds are an outer `vmap` over the state (`init_seeds`, `train_iteration_seeds`).
 """
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -165,7 +166,7 @@ def train_iteration(
         learner=learner,
         obs_stats=merge(state.obs_stats, window.steps.obs, every_step),
         value_stats=value_stats,
-        actors=after.replace(value_carry=judged.value_carry),
+        actors=replace(after, value_carry=judged.value_carry),
         key=key,
         iteration=state.iteration + 1,
     )
@@ -182,7 +183,7 @@ def rescale_value(learner: Learner, old: RunningStats, new: RunningStats) -> Lea
         "bias": (old.std * head["bias"] + old.mean - new.mean) / new.std,
     }
     params = {"params": {**params, "net": {**params["net"], "head": head}}}
-    return learner.replace(value=learner.value.replace(params=params))
+    return replace(learner, value=replace(learner.value, params=params))
 
 
 def _step_keys(config: PPOConfig, key: jax.Array) -> jax.Array:

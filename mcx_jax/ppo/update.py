@@ -6,6 +6,8 @@ come from): the step that sees it is not taken, and the rest are not computed (u
 seeds the `cond` becomes a `select`: computed and thrown away). Both presets use this one mechanism.
 """
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import optax
@@ -174,7 +176,7 @@ def update(
     )
     loss, grads = jax.value_and_grad(critic_loss)(learner.value.params, nets, batch)
     value, step = gradient_step(learner.value, grads, rates[1], config.max_grad_norm)
-    return Learner(policy, value), stats.replace(value_loss=loss, value_step=step)
+    return Learner(policy, value), replace(stats, value_loss=loss, value_step=step)
 
 
 def learn(
@@ -200,9 +202,9 @@ def learn(
 
 def take(batch: Batch, chosen: jax.Array) -> Batch:
     """The sequences `chosen` (M,) of a batch."""
-    per_step = batch.replace(policy_carry=None, value_carry=None)
+    per_step = replace(batch, policy_carry=None, value_carry=None)
     steps = jax.tree.map(lambda x: jnp.take(x, chosen, axis=1), per_step)
     carries = jax.tree.map(
         lambda x: jnp.take(x, chosen, axis=0), (batch.policy_carry, batch.value_carry)
     )
-    return steps.replace(policy_carry=carries[0], value_carry=carries[1])
+    return replace(steps, policy_carry=carries[0], value_carry=carries[1])
