@@ -1,0 +1,176 @@
+"""Command lines generated from the configuration dataclasses, and configurations as JSON.
+
+tyro draws boxes around its error messages and explains at length; here every mistake is one line
+(`UserError`) that names the flag and what is allowed. Nothing here imports JAX.
+"""
+
+import contextlib
+import dataclasses
+import io
+import json
+import re
+from collections.abc import Sequence
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+
+import tyro
+
+from mcx_jax.errors import UserError
+
+Config = TypeVar("Config")
+
+FORMAT = 1
+"""Version of config.json."""
+
+
+def parse(
+    config_type: type[Config], argv: Sequence[str], *, prog: str, default: Config | None = None
+) -> Config:
+    """Read a command line into a dataclass; nested dataclasses have flat flags.
+
+    Args:
+        config_type: the dataclass; field docstrings are the help texts.
+        argv: without the program's name.
+        prog: name of the command in `--help` (`python -m mcx_jax.<prog>`).
+        default: defaults other than the class's own.
+
+    Raises:
+        UserError: unknown flag, missing value, value of the wrong kind or out of range.
+    """
+    kwargs: dict[str, Any] = {} if default is None else {"default": default}
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(
+                config_type,
+                args=list(argv),
+                prog=f"python -m mcx_jax.{prog}",
+                config=(tyro.conf.OmitArgPrefixes, tyro.conf.OmitSubcommandPrefixes),
+                **kwargs,
+            )
+    except SystemExit as stop:
+        if stop.code in (0, None):  # --help
+            raise
+        raise UserError(_one_line(said.getvalue())) from None
+
+
+def _one_line(box: str) -> str:
+    """The message inside tyro's box, in our words where tyro speaks Python."""
+    text = _box_text(box)
+    if match := re.search(r"Error parsing (--\S+): invalid literal for int.*: '(.*)'", text):
+        return f"{match[1]} {match[2]}: must be a whole number"
+    if match := re.search(
+        r"Error parsing (--\S+): could not convert string to float: '(.*)'", text
+    ):
+        return f"{match[1]} {match[2]}: must be a number"
+    if match := re.search(r"invalid choice '(.*?)' for argument '(.*?)'.*\((.*?),?\)", text):
+        return f"{match[2]} {match[1]}: use one of {match[3].replace(chr(39), '')}"
+    if match := re.search(r"Missing value for argument '(.*?)'", text):
+        return f"{match[1]} needs a value"
+    if match := re.search(r"Unrecognized options: (.*)", text):
+        near = re.search(r"│\s+(--[\w-]+)", box.split("Perhaps you meant")[-1])
+        hint = f"did you mean {near[1]}? " if "Perhaps you meant" in box and near else ""
+        return f"unknown option {match[1].replace(',', '')}: {hint}--help lists all"
+    return text or "the command line could not be read; --help explains it"
+
+
+def _box_text(box: str) -> str:
+    """Text of the box above its first rule, unwrapped."""
+    lines = []
+    for line in box.splitlines():
+        inner = line.strip().strip("│╭╮╰╯").strip()
+        if line.lstrip().startswith(("╭", "╰")):
+            continue
+        if inner and set(inner) == {"─"}:
+            break
+        lines.append(inner)
+    return " ".join(" ".join(lines).split())
+
+
+def value_of(argv: Sequence[str], flag: str) -> str | None:
+    """Value of a flag that other defaults hang on, read before the real parsing; the last wins."""
+    value = None
+    for i, word in enumerate(argv):
+        if word.startswith(f"{flag}="):
+            value = word.split("=", 1)[1]
+        elif word == flag and i + 1 < len(argv):
+            value = argv[i + 1]
+    return value
+
+
+def optional_value(argv: Sequence[str], flag: str, default: str) -> list[str]:
+    """argv with `default` put after a flag that has no value."""
+    words = []
+    for i, word in enumerate(argv):
+        words.append(word)
+        bare = i + 1 == len(argv) or argv[i + 1].startswith("--")
+        if word == flag and bare:
+            words[-1] = f"{flag}={default}"
+    return words
+
+
+def config_to_json(config: Any) -> str:
+    """A configuration as JSON, with the format's version."""
+    return json.dumps({"format": FORMAT, **dataclasses.asdict(config)}, indent=1) + "\n"
+
+
+def config_from_json(config_type: type[Config], text: str, where: str = "config.json") -> Config:
+    """Inverse of `config_to_json`; strict.
+
+    Args:
+        where: name of the file, for messages.
+
+    Raises:
+        UserError: not JSON, another format, unknown or missing settings, values of the wrong kind.
+    """
+    try:
+        values = json.loads(text)
+    except ValueError:
+        raise UserError(f"{where}: not a JSON file, or cut short") from None
+    if not isinstance(values, dict) or values.pop("format", None) != FORMAT:
+        raise UserError(f"{where}: not a configuration of this version (format {FORMAT})")
+    return _build(config_type, values, where)
+
+
+def _build(config_type: type[Config], values: Any, where: str) -> Config:
+    hints = get_type_hints(config_type)
+    names = [f.name for f in dataclasses.fields(config_type)]  # type: ignore[arg-type]
+    if not isinstance(values, dict):
+        raise UserError(f"{where}: must hold settings, not {values!r}")
+    unknown = sorted(set(values) - set(names))
+    missing = [name for name in names if name not in values]
+    if unknown or missing:
+        problem = f"unknown setting {unknown[0]!r}" if unknown else f"no setting {missing[0]!r}"
+        raise UserError(f"{where}: {problem}; it was written by another version of mcx_jax")
+    checked = {name: _value(hints[name], values[name], f"{where}: {name}") for name in names}
+    return config_type(**checked)
+
+
+def _value(hint: Any, value: Any, where: str) -> Any:
+    """`value` as the type `hint`: a dataclass, a Literal, bool, int, float or str."""
+    if dataclasses.is_dataclass(hint):
+        return _build(hint, value, where)  # type: ignore[arg-type]
+    if get_origin(hint) is Literal:
+        if value not in get_args(hint):
+            raise UserError(f"{where} is {value!r}, must be one of {', '.join(get_args(hint))}")
+        return value
+    if hint is float and type(value) is int:
+        return float(value)
+    if type(value) is not hint:
+        raise UserError(f"{where} is {value!r}, must be of type {hint.__name__}")
+    return value
+
+
+def difference(ours: Any, theirs: Any) -> str | None:
+    """First setting in which two configurations differ, as '--flag ours, not theirs'; None: equal.
+
+    `theirs` is what was asked for.
+    """
+    for field in dataclasses.fields(ours):
+        a, b = getattr(ours, field.name), getattr(theirs, field.name)
+        if dataclasses.is_dataclass(a):
+            found = difference(a, b)
+            if found:
+                return found
+        elif a != b:
+            return f"--{field.name.replace('_', '-')} {a}, not {b}"
+    return None

@@ -1,0 +1,181 @@
+"""A trained policy by itself: what it is, how it acts, and its file.
+
+The file is a plain `.npz` without pickles: weights under their names (`policy/net/head/kernel`),
+the observation statistics, and one JSON string `metadata` (format version, network, configuration
+of the training run). NumPy alone reads it.
+"""
+
+import dataclasses
+import json
+import os
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct, traverse_util
+
+from mcx_jax.errors import UserError
+from mcx_jax.ppo.networks import Carry, Params, PolicyNet, init_params, step
+from mcx_jax.ppo.networks import init_carry as zero_carry
+from mcx_jax.ppo.normalise import RunningStats, init_stats, normalise_obs
+
+FORMAT = 1
+"""Version of the file."""
+KIND = "mcx_jax policy"
+
+
+@dataclasses.dataclass(frozen=True)
+class PolicyMeta:
+    """What a policy is besides its weights; hashable, so static under jit."""
+
+    obs_size: int
+    """Length of the observation."""
+    action_size: int
+    """Length of the action."""
+    hidden: int
+    """Width of the network."""
+    config: str = "{}"
+    """Configuration of the training run, JSON (`cli.config_from_json`)."""
+    iteration: int = 0
+    """Training iterations behind it."""
+    seed: int = 0
+    """Seed that it was trained with."""
+
+    @property
+    def net(self) -> PolicyNet:
+        """The network, without weights."""
+        return PolicyNet(self.hidden, self.action_size)
+
+
+@struct.dataclass
+class Policy:
+    """A policy that acts.
+
+    Attributes:
+        params: weights of the policy network.
+        obs_stats: statistics that observations are normalised with, (F,).
+        meta: the rest; static.
+    """
+
+    params: Params
+    obs_stats: RunningStats
+    meta: PolicyMeta = struct.field(pytree_node=False)
+
+
+def init_carry(policy: Policy, batch: tuple[int, ...] = ()) -> Carry:
+    """Memory at the start of an episode, for one environment or a batch (in front)."""
+    return zero_carry(policy.meta.net, batch)
+
+
+def act(policy: Policy, carry: Carry, obs: jax.Array) -> tuple[Carry, jax.Array]:
+    """The greedy action.
+
+    Args:
+        carry: memory, leaves (..., H).
+        obs: not normalised, (..., F).
+
+    Returns:
+        Memory, and the mean of the action distribution, (..., A) cm and crad.
+    """
+    seen = normalise_obs(policy.obs_stats, obs)
+    carry, mean, _ = step(policy.meta.net, policy.params, carry, seen)
+    return carry, mean
+
+
+@struct.dataclass
+class PolicyController:
+    """A policy with the two functions of a controller (`mcx_jax.controllers`), for ONE episode."""
+
+    policy: Policy
+
+    def init(self, env: Any, state: Any) -> Carry:
+        """Memory at the beginning of an episode."""
+        del env, state
+        return init_carry(self.policy)
+
+    def act(self, env: Any, state: Any, memory: Carry) -> tuple[Carry, jax.Array]:
+        """(memory, (A,) action in cm and crad)."""
+        del env
+        return act(self.policy, memory, state.obs)
+
+
+def save_policy(path: str | Path, policy: Policy) -> None:
+    """Write a policy file; whole or not at all."""
+    path = Path(path)
+    arrays = {name: np.asarray(x) for name, x in _named(policy).items()}
+    metadata = {"kind": KIND, "format": FORMAT, **dataclasses.asdict(policy.meta)}
+    partial = path.with_name(f".{path.name}.partial")
+    with partial.open("wb") as file:
+        np.savez(file, allow_pickle=False, metadata=json.dumps(metadata), **arrays)
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(path)
+
+
+def load_policy(path: str | Path) -> Policy:
+    """Read a policy file.
+
+    Raises:
+        UserError: missing, not a policy file, cut short, of another format, or with wrong shapes.
+    """
+    path = Path(path)
+    arrays = _read(path)
+    meta = _meta(path, arrays.pop("metadata", None))
+    expected = _named(_empty(meta))
+    for name, like in expected.items():
+        if name not in arrays or arrays[name].shape != like.shape:
+            raise UserError(f"{path}: not a whole policy file: {name} is missing or misshapen")
+    weights = {tuple(n.split("/")[1:]): jnp.asarray(arrays[n]) for n in expected if "obs/" not in n}
+    stats = {field: jnp.asarray(arrays[f"obs/{field}"]) for field in ("count", "mean", "var")}
+    return Policy(
+        params={"params": traverse_util.unflatten_dict(weights)},
+        obs_stats=RunningStats(**stats),
+        meta=meta,
+    )
+
+
+def _named(policy: Policy) -> dict[str, Any]:
+    """All arrays of a policy under the names that they have in the file."""
+    weights = traverse_util.flatten_dict(policy.params["params"], sep="/")
+    named = {f"policy/{name}": x for name, x in weights.items()}
+    stats = policy.obs_stats
+    return {**named, "obs/count": stats.count, "obs/mean": stats.mean, "obs/var": stats.var}
+
+
+def _empty(meta: PolicyMeta) -> Policy:
+    """A policy's shapes."""
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    params = jax.eval_shape(lambda k: init_params(meta.net, k, meta.obs_size), key)
+    return Policy(params=params, obs_stats=init_stats((meta.obs_size,)), meta=meta)
+
+
+def _read(path: Path) -> dict[str, np.ndarray]:
+    if not path.is_file():
+        raise UserError(
+            f"no policy at {path}: train one (python -m mcx_jax.train), or name a policy .npz"
+        )
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile):
+        raise UserError(f"{path}: not a policy file of mcx_jax, or cut short") from None
+
+
+def _meta(path: Path, text: np.ndarray | None) -> PolicyMeta:
+    foreign = UserError(f"{path}: not a policy file of mcx_jax (no metadata of its kind)")
+    try:
+        values = json.loads(str(text))
+        kind, version = values.pop("kind"), values.pop("format")
+    except (ValueError, KeyError, AttributeError):
+        raise foreign from None
+    if kind != KIND:
+        raise foreign
+    if version != FORMAT:
+        raise UserError(f"{path}: policy file of format {version}; this version reads {FORMAT}")
+    try:
+        return PolicyMeta(**values)
+    except TypeError:
+        raise foreign from None

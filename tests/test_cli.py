@@ -1,0 +1,127 @@
+"""Command lines and configuration files: each mistake is one line with the flag and what to do."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+
+from mcx_jax import cli
+from mcx_jax.config import EnvConfig, TrainConfig, preset_config
+from mcx_jax.errors import UserError
+
+
+def _parse(*argv):
+    return cli.parse(TrainConfig, argv, prog="train", default=preset_config("fast"))
+
+
+def test_flags_are_flat():
+    config = _parse("--delay", "E2", "--num-envs", "64", "--gamma", "0.95", "--sea", "Wd")
+    assert config.env.delay == "E2" and config.num_envs == 64
+    assert config.ppo.gamma == 0.95 and config.motion.sea == "Wd"
+    assert config.env.episode_steps == 1024  # the preset's, not the class's
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        ("--num-envs x", "--num-envs x: must be a whole number"),
+        ("--num-envs 1.5", "--num-envs 1.5: must be a whole number"),
+        ("--num-envs -5", "--num-envs -5: must be a positive integer"),
+        ("--gamma much", "--gamma much: must be a number"),
+        ("--physics bullet", "--physics bullet: use one of chain, mjx"),
+        ("--preset slow", "--preset slow: use one of fast, paper"),
+        ("--num-envs", "--num-envs needs a value"),
+        ("--num-env 5", "unknown option --num-env 5: did you mean --num-envs? --help lists all"),
+        ("--qqq 3", "unknown option --qqq 3: --help lists all"),
+        ("fast", "unknown option fast: --help lists all"),
+        ("--seed -1", "--seed -1: must be 0 or a positive integer"),
+        (
+            "--num-envs 12",
+            "--num-envs 12 gives 12 sequences a window, which --minibatches 8 does not divide; "
+            "use a multiple of 8",
+        ),
+        (
+            "--delay butter:4:25Hz",
+            "--delay butter:4:25Hz: the cutoff must be at least 0.1 Hz and below the Nyquist "
+            "frequency 25 Hz (control runs at 50 Hz)",
+        ),
+        (
+            "--delay late",
+            "unknown delay 'late': use one of E0, E1, E2, B4_21, B4_4, E<k> for k control steps, "
+            "or butter:<order>:<cutoff>Hz, e.g. butter:4:7.5Hz",
+        ),
+    ],
+)
+@pytest.mark.parametrize("columns", ["40", "120"])
+def test_mistakes_are_one_line(argv, message, columns, monkeypatch):
+    monkeypatch.setenv("COLUMNS", columns)
+    with pytest.raises(UserError) as error:
+        _parse(*argv.split())
+    assert str(error.value) == message
+
+
+def test_help_shows_the_defaults_and_ends_well(capsys):
+    with pytest.raises(SystemExit) as stop:
+        _parse("--help")
+    assert stop.value.code == 0
+    assert "--num-envs" in capsys.readouterr().out
+
+
+def test_value_of_and_optional_value():
+    argv = ["--preset", "fast", "--json", "--preset=paper"]
+    assert cli.value_of(argv, "--preset") == "paper"
+    assert cli.value_of(argv, "--seed") is None
+    assert cli.optional_value(argv, "--json", "-")[2] == "--json=-"
+    assert cli.optional_value(["--json", "a.json"], "--json", "-") == ["--json", "a.json"]
+    assert cli.optional_value(["--json"], "--json", "-") == ["--json=-"]
+
+
+def test_configuration_survives_json():
+    config = replace(preset_config("paper"), seed=3, env=EnvConfig(delay="butter:4:7.5Hz"))
+    assert cli.config_from_json(TrainConfig, cli.config_to_json(config)) == config
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"wind": 3},
+            "config.json: unknown setting 'wind'; it was written by another version of mcx_jax",
+        ),
+        (
+            {"seed": None},
+            "config.json: no setting 'seed'; it was written by another version of mcx_jax",
+        ),
+        ({"seed": "0"}, "config.json: seed is '0', must be of type int"),
+        ({"seed": True}, "config.json: seed is True, must be of type int"),
+        ({"preset": "slow"}, "config.json: preset is 'slow', must be one of fast, paper"),
+        ({"env": 3}, "config.json: env: must hold settings, not 3"),
+        ({"format": 99}, "config.json: not a configuration of this version (format 1)"),
+    ],
+)
+def test_strange_configuration_files(change, message):
+    values = json.loads(cli.config_to_json(preset_config("fast")))
+    values = {k: v for k, v in {**values, **change}.items() if v is not None}
+    with pytest.raises(UserError) as error:
+        cli.config_from_json(TrainConfig, json.dumps(values))
+    assert str(error.value) == message
+
+
+def test_cut_short_configuration_file():
+    text = cli.config_to_json(preset_config("fast"))
+    with pytest.raises(UserError, match="config.json: not a JSON file, or cut short"):
+        cli.config_from_json(TrainConfig, text[:40])
+
+
+def test_difference_names_the_flag():
+    config = preset_config("fast")
+    assert cli.difference(config, config) is None
+    other = replace(config, env=replace(config.env, delay="E1"))
+    assert cli.difference(config, other) == "--delay B4_4, not E1"
+
+
+def test_parsing_needs_no_jax():
+    code = "import sys, mcx_jax.cli, mcx_jax.config; sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,128 @@
+"""The policy file: same actions after loading, and one clear line for a file that is not one."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mcx_jax.errors import UserError
+from mcx_jax.policy import (
+    Policy,
+    PolicyController,
+    PolicyMeta,
+    act,
+    init_carry,
+    load_policy,
+    save_policy,
+)
+from mcx_jax.ppo.networks import init_params
+from mcx_jax.ppo.normalise import RunningStats
+
+
+@pytest.fixture(scope="module")
+def policy():
+    meta = PolicyMeta(obs_size=5, action_size=3, hidden=8, config='{"a": 1}', iteration=7, seed=2)
+    stats = RunningStats(jnp.ones(()), jnp.linspace(0, 1, 5), jnp.linspace(1, 2, 5))
+    return Policy(init_params(meta.net, jax.random.key(0), 5), stats, meta)
+
+
+@pytest.fixture
+def saved(policy, tmp_path):
+    path = tmp_path / "policy.npz"
+    save_policy(path, policy)
+    return path
+
+
+def test_acts_the_same_after_loading(policy, saved):
+    loaded = load_policy(saved)
+    assert loaded.meta == policy.meta
+    jax.tree.map(np.testing.assert_array_equal, loaded.params, policy.params)
+    jax.tree.map(np.testing.assert_array_equal, loaded.obs_stats, policy.obs_stats)
+    assert [p.name for p in saved.parent.iterdir()] == ["policy.npz"]
+
+
+def test_one_environment_or_a_batch(policy):
+    obs = jax.random.normal(jax.random.key(1), (4, 5))
+    _, together = act(policy, init_carry(policy, (4,)), obs)
+    for k in range(4):
+        carry, alone = act(policy, init_carry(policy), obs[k])
+        np.testing.assert_allclose(alone, together[k], atol=1e-6)
+    assert alone.shape == (3,) and carry.h.shape == (8,)
+
+
+def test_controller_under_vmap_with_the_batch_last(policy):
+    class State:
+        obs = None
+
+    obs = jax.random.normal(jax.random.key(1), (5, 4))
+    controller = PolicyController(policy)
+
+    def one(memory, obs):
+        state = State()
+        state.obs = obs
+        return controller.act(None, state, memory)
+
+    memory = jax.tree.map(lambda x: jnp.stack([x] * 4, -1), controller.init(None, None))
+    _, actions = jax.vmap(one, in_axes=-1, out_axes=-1)(memory, obs)
+    np.testing.assert_allclose(
+        actions.T, act(policy, init_carry(policy, (4,)), obs.T)[1], atol=1e-6
+    )
+
+
+def test_numpy_alone_reads_the_file(saved):
+    with np.load(saved, allow_pickle=False) as file:
+        metadata = json.loads(str(file["metadata"]))
+        assert file["policy/net/head/kernel"].shape == (8, 3)
+    assert metadata["format"] == 1 and metadata["obs_size"] == 5
+
+
+def _refused(path, message):
+    with pytest.raises(UserError) as error:
+        load_policy(path)
+    assert str(error.value) == message.format(path=path)
+
+
+def test_missing(tmp_path):
+    _refused(
+        tmp_path / "none.npz",
+        "no policy at {path}: train one (python -m mcx_jax.train), or name a policy .npz",
+    )
+
+
+@pytest.mark.parametrize("keep", [0, 10, 400, 0.5, 0.99])
+def test_cut_short(saved, keep):
+    whole = saved.read_bytes()
+    saved.write_bytes(whole[: int(keep * len(whole)) if isinstance(keep, float) else keep])
+    _refused(saved, "{path}: not a policy file of mcx_jax, or cut short")
+
+
+def test_foreign(tmp_path):
+    path = tmp_path / "other.npz"
+    np.savez(path, x=np.zeros(3))
+    _refused(path, "{path}: not a policy file of mcx_jax (no metadata of its kind)")
+    np.savez(path, metadata="3")
+    _refused(path, "{path}: not a policy file of mcx_jax (no metadata of its kind)")
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    _refused(tmp_path / "array.npy", "{path}: not a policy file of mcx_jax, or cut short")
+
+
+def _rewrite(path, **changes):
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files}
+    arrays.update(changes)
+    np.savez(path, **{k: v for k, v in arrays.items() if v is not None})
+
+
+def test_of_another_format(saved):
+    with np.load(saved) as file:
+        metadata = json.loads(str(file["metadata"]))
+    _rewrite(saved, metadata=json.dumps({**metadata, "format": 9}))
+    _refused(saved, "{path}: policy file of format 9; this version reads 1")
+
+
+@pytest.mark.parametrize("value", [None, np.zeros(4)])
+def test_without_a_weight(saved, value):
+    _rewrite(saved, **{"policy/raw_sigma": value})
+    _refused(saved, "{path}: not a whole policy file: policy/raw_sigma is missing or misshapen")
