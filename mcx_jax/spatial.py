@@ -8,7 +8,6 @@ the environments, so XLA sees elementwise work only: no batched 3x3 matmul, no t
 Rotations are active: `R_A_B` maps coordinates in frame B to coordinates in frame A.
 """
 
-import math
 from collections.abc import Sequence
 from functools import reduce
 from typing import Any
@@ -223,7 +222,7 @@ def snap(x: float) -> float:
     Quaternions like (0.5^0.5, 0, 0.5^0.5, 0) otherwise give 2e-16 instead of the 0 that folds.
     """
     nearest = float(round(x))
-    if abs(nearest) <= 1.0 and math.isclose(x, nearest, abs_tol=1e-12):
+    if abs(nearest) <= 1.0 and abs(x - nearest) <= 1e-12:
         return nearest + 0.0
     return float(x)
 
