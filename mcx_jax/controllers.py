@@ -92,9 +92,8 @@ class Preview:
     def act(self, env: V2VEnv, state: EnvState, memory: tuple[()]):
         """Aim at the pose that the goal will have."""
         lead = round(_lead_s(env, self.lead_s) / PHYSICS_DT_S)
-        goal_m = unpack(state.goal_m, 3)
         step = state.step * SUBSTEPS + lead
-        ahead = goal_pose(env.motion, state.track, goal_m, step)  # type: ignore[arg-type]
+        ahead = goal_pose(env.motion, state.track, state.goal_m, step)
         now = unpack_matrix(state.goal_rotation), unpack(state.goal_position, 3)
         return memory, _correction(now, ahead)  # type: ignore[arg-type]
 

@@ -8,10 +8,12 @@ the environments, so XLA sees elementwise work only: no batched 3x3 matmul, no t
 Rotations are active: `R_A_B` maps coordinates in frame B to coordinates in frame A.
 """
 
+import math
 from collections.abc import Sequence
 from functools import reduce
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 Scalar = Any
@@ -127,11 +129,42 @@ def rotate_z(m: Mat, c: Scalar, s: Scalar) -> Mat:
     )
 
 
+@jax.custom_jvp
+def sincos(x: Scalar) -> tuple[Scalar, Scalar]:
+    """(sin x, cos x) of an angle in radians, |x| < 1e4.
+
+    In float32 a polynomial after reduction by multiples of pi/2 in three parts: XLA's own sine is
+    not vectorised on CPU and took 85 % of a physics step (0.7 M against 4.6 M steps/s). Error
+    below 1e-7 for |x| < 100. Coefficients: Chebyshev fit on [-pi/4, pi/4], 1e-8 and 8e-10. In
+    float64, where only tests run, XLA's own.
+    """
+    x = jnp.asarray(x)
+    if x.dtype != jnp.float32:
+        return jnp.sin(x), jnp.cos(x)
+    turns = jnp.round(x * (2.0 / math.pi))
+    # 1.5703125 has 8 bits: exact for 2^15 quarter turns; the rest of pi/2 in two more parts.
+    r = ((x - turns * 1.5703125) - turns * 4.837512969970703e-4) - turns * 7.549789948768648e-8
+    z = r * r
+    s = r * (1.0 + z * (-0.16666664665 + z * (0.008332748634 - z * 0.000195879498)))
+    c = 1.0 - 0.5 * z + z * z * (0.041666664662 + z * (-0.001388830334 + z * 2.454799126e-5))
+    quarter = turns.astype(jnp.int32)
+    odd = (quarter & 1) == 1
+    sin, cos = jnp.where(odd, c, s), jnp.where(odd, s, c)
+    return (
+        jnp.where((quarter & 2) == 2, -sin, sin),
+        jnp.where(((quarter + 1) & 2) == 2, -cos, cos),
+    )
+
+
+@sincos.defjvp
+def _sincos_jvp(primals, tangents):
+    sin, cos = sincos(primals[0])
+    return (sin, cos), (cos * tangents[0], -sin * tangents[0])
+
+
 def rotation_rpy(roll: Scalar, pitch: Scalar, yaw: Scalar) -> Mat:
     """Rz(yaw) Ry(pitch) Rx(roll), angles in radians (aerospace order, extrinsic xyz)."""
-    cr, sr = jnp.cos(roll), jnp.sin(roll)
-    cp, sp = jnp.cos(pitch), jnp.sin(pitch)
-    cy, sy = jnp.cos(yaw), jnp.sin(yaw)
+    (sr, cr), (sp, cp), (sy, cy) = sincos(roll), sincos(pitch), sincos(yaw)
     return (
         (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
         (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),

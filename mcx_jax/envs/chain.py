@@ -7,6 +7,7 @@ acceleration, so an accelerating deck is exact and costs nothing.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,7 @@ from mcx_jax.spatial import (
     matvec,
     mul,
     rotate_z,
+    sincos,
     sub,
     tmatvec,
     total,
@@ -30,25 +32,29 @@ from mcx_jax.spatial import (
     vadd,
     vscale,
 )
+from mcx_jax.stage import stage
 
 BaseState = tuple[Vec, Vec, Vec]
 """(w, al, a) of the base in base axes B: angular velocity rad/s, angular acceleration rad/s2, and
 acceleration of the base origin minus gravity, m/s2 (at rest and level: 0, 0, +9.81)."""
 
 
-def link_rotations(model: ChainModel, q: Sequence[Scalar]) -> list[Mat]:
-    """Orientation of every link in its parent, from the joint angles (rad)."""
-    return [
-        rotate_z(link.rotation, jnp.cos(angle - link.q_ref), jnp.sin(angle - link.q_ref))
-        for link, angle in zip(model.links, q, strict=True)
-    ]
+def joint_sincos(model: ChainModel, q: Sequence[Scalar]) -> list[tuple[Scalar, Scalar]]:
+    """(sin, cos) of every joint angle (rad) counted from the model's reference."""
+    return [sincos(angle - link.q_ref) for link, angle in zip(model.links, q, strict=True)]
+
+
+def link_rotations(model: ChainModel, angles: Sequence[tuple[Scalar, Scalar]]) -> list[Mat]:
+    """Orientation of every link in its parent, from `joint_sincos`."""
+    return [rotate_z(link.rotation, c, s) for link, (s, c) in zip(model.links, angles, strict=True)]
 
 
 def bias_forces(
-    model: ChainModel, rotations: list[Mat], qd: Sequence[Scalar], base: BaseState
+    model: ChainModel, angles: Sequence[tuple], qd: Sequence[Scalar], base: BaseState
 ) -> list[Scalar]:
     """Joint torques that hold all joint accelerations at zero, N m (recursive Newton-Euler)."""
     w, al, a = base
+    rotations = link_rotations(model, angles)
     wrenches = []
     for link, r, rate in zip(model.links, rotations, qd, strict=True):
         a = tmatvec(r, vadd(a, _offset_acceleration(w, al, link.position)))
@@ -94,9 +100,10 @@ def _project(model: ChainModel, rotations: list[Mat], wrenches: list) -> list[Sc
     return torques
 
 
-def mass_matrix(model: ChainModel, rotations: list[Mat]) -> list[list[Scalar]]:
+def mass_matrix(model: ChainModel, angles: Sequence[tuple]) -> list[list[Scalar]]:
     """Lower triangle of the joint-space mass matrix, kg m2 (composite rigid bodies)."""
     n = model.nq
+    rotations = link_rotations(model, angles)
     mass_rows: list[list[Scalar]] = [[0.0] * (i + 1) for i in range(n)]
     composite = None
     for i in reversed(range(n)):
@@ -222,20 +229,41 @@ def joint_accelerations(
     qd: Sequence[Scalar],
     ctrl: Sequence[Scalar],
     base: BaseState,
+    wall: jax.Array | None = None,
 ) -> list[Scalar]:
     """The acceleration that MuJoCo's integrator multiplies by the time step, rad/s2.
 
     euler: M + h D with the joints' own damping D; implicitfast: the actuators' velocity derivative
-    as well (for a model without damping, euler's is the forward dynamics).
+    as well (for a model without damping, euler's is the forward dynamics). straight-through: the
+    value of euler, the derivative of implicitfast (the servo chatters under euler: its derivative
+    is true and useless).
     """
-    rotations = link_rotations(model, q)
+    angles = stage(wall, partial(joint_sincos, model), list(q))
+    bias = stage(wall, partial(bias_forces, model), angles, list(qd), base)
+    matrix = stage(wall, partial(mass_matrix, model), angles)
     torque, slopes = actuate(model, q, qd, ctrl)
-    rhs = [sub(t, b) for t, b in zip(torque, bias_forces(model, rotations, qd, base), strict=True)]
-    implicit = slopes if integrator == "implicitfast" else [link.damping for link in model.links]
-    matrix = mass_matrix(model, rotations)
-    for i, slope in enumerate(implicit):
-        matrix[i][i] = add(matrix[i][i], mul(model.timestep_s, slope))
-    return solve(factor(matrix), rhs)
+    rhs = [sub(t, b) for t, b in zip(torque, bias, strict=True)]
+    passive = [link.damping for link in model.links]
+
+    def accelerations(implicit):
+        factors = stage(wall, factor, _stiffened(matrix, implicit, model.timestep_s))
+        return stage(wall, solve, factors, rhs)
+
+    if integrator == "euler":
+        return accelerations(passive)
+    smooth = accelerations(slopes)
+    if integrator == "implicitfast":
+        return smooth
+    rough = lax.stop_gradient(accelerations(passive))
+    return [x + (r - lax.stop_gradient(x)) for x, r in zip(smooth, rough, strict=True)]
+
+
+def _stiffened(matrix: list[list[Scalar]], slopes: Sequence[Scalar], h_s: float):
+    """M + h D."""
+    return [
+        [*row[:-1], add(row[-1], mul(h_s, slope))]
+        for row, slope in zip(matrix, slopes, strict=True)
+    ]
 
 
 def substep(
@@ -245,10 +273,11 @@ def substep(
     qd: Sequence[Scalar],
     ctrl: Sequence[Scalar],
     base: BaseState,
+    wall: jax.Array | None = None,
 ) -> tuple[list[Scalar], list[Scalar]]:
     """One physics step, semi-implicit as MuJoCo: new velocities, then positions with them."""
     h = model.timestep_s
-    qdd = joint_accelerations(model, integrator, q, qd, ctrl, base)
+    qdd = joint_accelerations(model, integrator, q, qd, ctrl, base, wall)
     qd = [v + h * a for v, a in zip(qd, qdd, strict=True)]
     return [x + h * v for x, v in zip(q, qd, strict=True)], qd
 
@@ -261,6 +290,7 @@ def substeps(
     ctrl: jax.Array,
     base_at: Callable[[jax.Array], BaseState],
     count: int,
+    wall: jax.Array | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """`count` physics steps with the actuator commands held.
 
@@ -269,6 +299,7 @@ def substeps(
         qd: (nq,) joint velocities, rad/s.
         ctrl: (nu,) actuator commands in the model's order.
         base_at: base motion at physics step i of this control step.
+        wall: see `stage`.
 
     Returns:
         (q, qd) after the steps.
@@ -276,8 +307,8 @@ def substeps(
     commands = [ctrl[i] for i in range(len(model.actuators))]
 
     def body(i, state):
-        angles, rates = state
-        angles, rates = substep(model, integrator, angles, rates, commands, base_at(i))
+        base = stage(wall, base_at, i)
+        angles, rates = substep(model, integrator, *state, commands, base, wall)
         return tuple(angles), tuple(rates)
 
     n = model.nq

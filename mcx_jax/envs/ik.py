@@ -8,7 +8,8 @@ The step is taken in task space: (J^T J + d 1)^-1 J^T e = J^T (J J^T + d 1)^-1 e
 any number of joints, and the least-norm step where there are more than six.
 """
 
-import functools
+from collections.abc import Sequence
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -36,6 +37,7 @@ from mcx_jax.spatial import (
     vadd,
     vsub,
 )
+from mcx_jax.stage import stage
 
 REGULARISATION = 3e-2
 """Damping of the normal equations far from the target (dm_control's default)."""
@@ -64,17 +66,20 @@ class IKResult:
     """() bool: error below TOLERANCE and finite."""
 
 
-def tool_pose(model: ChainModel, q: tuple[Scalar, ...]) -> tuple[Mat, Vec]:
+def tool_pose(
+    model: ChainModel, q: Sequence[Scalar], wall: jax.Array | None = None
+) -> tuple[Mat, Vec]:
     """(R_B_E, p_B_E) of the tool site at joint angles q (rad), metres."""
-    r, p, _, _ = _kinematics(model, q)
+    angles = stage(wall, partial(chain.joint_sincos, model), list(q))
+    r, p, _, _ = stage(wall, partial(_kinematics, model), angles)
     return r, p
 
 
-def _kinematics(model: ChainModel, q) -> tuple[Mat, Vec, list[Vec], list[Vec]]:
+def _kinematics(model: ChainModel, angles) -> tuple[Mat, Vec, list[Vec], list[Vec]]:
     """Tool pose, and each hinge's axis and anchor, in B."""
     r, p = EYE, ZERO
     axes, anchors = [], []
-    for link, rotation in zip(model.links, chain.link_rotations(model, q), strict=True):
+    for link, rotation in zip(model.links, chain.link_rotations(model, angles), strict=True):
         p = vadd(p, matvec(r, link.position))
         r = matmul(r, rotation)
         axes.append((r[0][2], r[1][2], r[2][2]))
@@ -83,36 +88,51 @@ def _kinematics(model: ChainModel, q) -> tuple[Mat, Vec, list[Vec], list[Vec]]:
     return matmul(r, model.site_rotation), tool, axes, anchors
 
 
-def _newton(model: ChainModel, q: tuple, target: tuple[Mat, Vec]) -> tuple[tuple, Scalar]:
+def _newton(
+    model: ChainModel, wall: jax.Array | None, q: tuple, target: tuple[Mat, Vec]
+) -> tuple[tuple, Scalar]:
     """One damped least-squares step and the error norm before it.
 
     Differentiable in `target` with the Jacobian as is (its own derivative multiplies the error,
     which is zero at the solution: the implicit function theorem).
     """
     frozen = tuple(lax.stop_gradient(x) for x in q)
-    r, p, axes, anchors = _kinematics(model, frozen)
-    e_p = vsub(target[1], p)
-    e_r = log_rotation(matmul(target[0], transpose(r)))
-    error = norm(e_p) + norm(e_r)
+    angles = stage(wall, partial(chain.joint_sincos, model), frozen)
+    r, p, axes, anchors = stage(wall, partial(_kinematics, model), angles)
+    e = stage(wall, _pose_error, (r, p), target)
+    error = norm(e[:3]) + norm(e[3:])
     columns = [(*cross(z, vsub(p, o)), *z) for z, o in zip(axes, anchors, strict=True)]
     damping = jnp.where(error > REGULARISATION_ABOVE, REGULARISATION, 0.0)
-    step = _least_squares(columns, (*e_p, *e_r), lax.stop_gradient(damping))
+    gram = stage(wall, _normal_matrix, columns, lax.stop_gradient(damping))
+    step = _least_squares(wall, columns, gram, e)
     length = norm(step)
     shrink = jnp.where(length > MAX_STEP_RAD, MAX_STEP_RAD / jnp.maximum(length, 1e-9), 1.0)
     moved = tuple(x + shrink * dx for x, dx in zip(frozen, step, strict=True))
     return _within_limits(model, moved), error
 
 
-def _least_squares(columns: list[tuple], e: tuple, damping: Scalar) -> list[Scalar]:
-    """J^T (J J^T + damping 1)^-1 e for J given by its columns (one 6-vector a joint)."""
+def _pose_error(tool: tuple[Mat, Vec], target: tuple[Mat, Vec]) -> tuple[Scalar, ...]:
+    """Position error (m) and rotation vector error (rad), both in B."""
+    turn = log_rotation(matmul(target[0], transpose(tool[0])))
+    return (*vsub(target[1], tool[1]), *turn)
+
+
+def _normal_matrix(columns: list[tuple], damping: Scalar) -> list[list[Scalar]]:
+    """Lower triangle of J J^T + damping 1, for J given by its columns (one 6-vector a joint)."""
     gram = [
         [total([mul(col[i], col[j]) for col in columns]) for j in range(i + 1)] for i in range(6)
     ]
     # Ten roundings of the largest possible entry keep the pivots positive at a singular posture.
-    floor = 10.0 * jnp.finfo(jnp.result_type(e[0])).eps
+    floor = 10.0 * jnp.finfo(jnp.result_type(damping)).eps
     for i in range(6):
         gram[i][i] = add(gram[i][i], damping + floor)
-    multipliers = chain.solve(chain.factor(gram), e)
+    return gram
+
+
+def _least_squares(wall, columns: list[tuple], gram, e: tuple) -> list[Scalar]:
+    """J^T (J J^T + damping 1)^-1 e."""
+    factors = stage(wall, chain.factor, gram)
+    multipliers = stage(wall, chain.solve, factors, list(e))
     return [dot(col, multipliers) for col in columns]  # type: ignore[arg-type]
 
 
@@ -124,7 +144,11 @@ def _within_limits(model: ChainModel, q: tuple) -> tuple:
 
 
 def solve(
-    model: ChainModel, q_start: jax.Array, target: tuple[Mat, Vec], iterations: int
+    model: ChainModel,
+    q_start: jax.Array,
+    target: tuple[Mat, Vec],
+    iterations: int,
+    wall: jax.Array | None = None,
 ) -> IKResult:
     """Joint angles that bring the tool to a pose.
 
@@ -132,25 +156,26 @@ def solve(
         q_start: (nq,) where the search starts, rad; the branch next to it is found.
         target: (R_B_H, p_B_H), rotation and position (m) of the wanted tool pose in B.
         iterations: damped least-squares steps.
+        wall: see `stage`.
 
     Returns:
         IKResult. Its gradient by `target` is the implicit function theorem's, J^+ de; the gradient
         by `q_start` is zero. A non-finite solve returns q_start with ok = False.
     """
     start = tuple(lax.stop_gradient(q_start[i]) for i in range(model.nq))
-    q, error = _iterate(model, iterations, start, target)
+    q, error = _iterate(model, iterations, wall, start, target)
     error = lax.stop_gradient(error)
     finite = jnp.isfinite(error)
     q = tuple(jnp.where(finite, x, s) for x, s in zip(q, start, strict=True))
     return IKResult(q=jnp.stack(q), error=error, ok=finite & (error < TOLERANCE))
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _iterate(model: ChainModel, iterations: int, start: tuple, target: tuple[Mat, Vec]):
+@partial(jax.custom_jvp, nondiff_argnums=(0, 1))
+def _iterate(model: ChainModel, iterations: int, wall, start: tuple, target: tuple[Mat, Vec]):
     """(joint angles, error norm before the last step) after some damped least-squares steps."""
 
     def body(_, carry):
-        return _newton(model, carry[0], target)
+        return _newton(model, wall, carry[0], target)
 
     unknown = jnp.full_like(start[0], jnp.inf)
     return lax.fori_loop(0, iterations, body, (start, unknown))
@@ -159,6 +184,7 @@ def _iterate(model: ChainModel, iterations: int, start: tuple, target: tuple[Mat
 @_iterate.defjvp
 def _iterate_jvp(model, iterations, primals, tangents):
     """One Newton step at the solution, differentiated by the target alone."""
+    wall, _, target = primals
     q, error = _iterate(model, iterations, *primals)
-    _, dq = jax.jvp(lambda t: _newton(model, q, t)[0], (primals[1],), (tangents[1],))
+    _, dq = jax.jvp(lambda t: _newton(model, wall, q, t)[0], (target,), (tangents[2],))
     return (q, error), (dq, jnp.zeros_like(error))

@@ -1,4 +1,4 @@
-"""The vessel-to-vessel task: `reset(key) -> state`, `step(state, action) -> state`, for ONE episode.
+"""The vessel-to-vessel task, ONE episode: `reset(key) -> state`, `step(state, action) -> state`.
 
 Pure, jittable, vmappable, differentiable. `vmap` it with the batch axis last
 (`in_axes=-1, out_axes=-1`): the physics then works on contiguous rows of environments.
@@ -18,6 +18,7 @@ from mcx_jax.envs.motion import Motion, Track, draw_track, load_motion
 from mcx_jax.envs.vessels import Segment
 from mcx_jax.errors import UserError
 from mcx_jax.spatial import Mat, Vec, exp_rotation, matmul, matvec, norm, unpack, vadd, vscale
+from mcx_jax.stage import stage
 
 START_POSE_RAD = (-0.1, -1.0, 2.4, -2.9, -1.5, 0.0)
 """Where the first IK of an episode starts (authors' code)."""
@@ -88,6 +89,8 @@ class V2VEnv:
     motion: Motion
     mjx_model: object
     """mjx.Model for --physics mjx, else None."""
+    wall: jax.Array | None
+    """() bool, true: keeps XLA on CPU from recomputing stages (see mcx_jax.stage); None on a GPU."""
     model: ChainModel = struct.field(pytree_node=False)
     delay: Delay = struct.field(pytree_node=False)
     integrator: str = struct.field(pytree_node=False)
@@ -110,21 +113,21 @@ class V2VEnv:
         Args:
             sea: index into motion.seas; None draws one.
         """
-        key_track, key_goal = jax.random.split(key)
-        track = draw_track(self.motion, key_track, sea)
-        goal_m = vessels.draw_goal(key_goal)
+        uniform = jax.random.uniform(key, (7,))
+        track = draw_track(self.motion, uniform[:4], sea)
+        goal_m = vessels.draw_goal(uniform[4:])
         with jax.named_scope("vessels"):
             seg_a, seg_b = self._segments(track, jnp.int32(0))
-            goal = vessels.goal_in_base(seg_a, seg_b, unpack(goal_m, 3), 0)  # type: ignore[arg-type]
+            goal = stage(self.wall, vessels.goal_in_base, seg_a, seg_b, goal_m, 0)
         with jax.named_scope("ik"):
             start = jnp.asarray(_start_pose(self.model), goal_m.dtype)
-            found = ik.solve(self.model, start, goal, ik.COLD_ITERATIONS)
+            found = ik.solve(self.model, start, goal, ik.COLD_ITERATIONS, self.wall)
         with jax.named_scope("settle"):
             arm = ArmState(q=found.q, qd=jnp.zeros_like(found.q))
             still = vessels.still(seg_a)
             arm = self._simulate(arm, found.q, jnp.zeros_like(found.q), still, SETTLE_STEPS)
-        tool = ik.tool_pose(self.model, unpack(arm.q, self.model.nq))
-        errors = observe.tracking_error(goal, tool)
+        tool = ik.tool_pose(self.model, unpack(arm.q, self.model.nq), self.wall)
+        errors = stage(self.wall, observe.tracking_error, goal, tool)
         return EnvState(
             arm=arm,
             lag=lag.init(self.delay, found.q),
@@ -148,21 +151,21 @@ class V2VEnv:
         """
         goal = _goal(state)
         with jax.named_scope("correct"):
-            target = correct(goal, action)
+            target = stage(self.wall, correct, goal, action)
         with jax.named_scope("ik"):
-            found = ik.solve(self.model, state.arm.q, target, ik.WARM_ITERATIONS)
+            found = ik.solve(self.model, state.arm.q, target, ik.WARM_ITERATIONS, self.wall)
         with jax.named_scope("lag"):
             lag_state, reference = lag.apply(self.delay, state.lag, found.q)
             rate = (reference - state.reference) / CONTROL_DT_S
             rate = jnp.where(state.step == 0, 0.0, rate)
         with jax.named_scope("vessels"):
             seg_a, seg_b = self._segments(state.track, state.step)
-            goal = vessels.goal_in_base(seg_a, seg_b, unpack(state.goal_m, 3), SUBSTEPS)  # type: ignore[arg-type]
+            goal = stage(self.wall, vessels.goal_in_base, seg_a, seg_b, state.goal_m, SUBSTEPS)
         with jax.named_scope("arm"):
             arm = self._simulate(state.arm, reference, rate, seg_a, SUBSTEPS)
         with jax.named_scope("observe"):
-            tool = ik.tool_pose(self.model, unpack(arm.q, self.model.nq))
-            errors = observe.tracking_error(goal, tool)
+            tool = ik.tool_pose(self.model, unpack(arm.q, self.model.nq), self.wall)
+            errors = stage(self.wall, observe.tracking_error, goal, tool)
             obs = observe.observe(goal, tool, errors)
         valid = state.metrics.valid & _valid(found, arm, errors[0])
         return state.replace(
@@ -211,7 +214,7 @@ def correct(goal: tuple[Mat, Vec], action: jax.Array) -> tuple[Mat, Vec]:
 
 
 def command(model: ChainModel, reference: jax.Array, rate: jax.Array) -> jax.Array:
-    """(nu,) actuator commands: position servos get the joint reference, velocity servos its rate."""
+    """(nu,) actuator commands: position servos get the reference, velocity servos its rate."""
     return jnp.stack([(reference if act.bias[1] else rate)[act.joint] for act in model.actuators])
 
 
@@ -260,6 +263,7 @@ def make_env(
     return V2VEnv(
         motion=load_motion(motion_config, config.episode_steps, split),
         mjx_model=mjx_model,
+        wall=jnp.asarray(True) if jax.default_backend() == "cpu" else None,
         model=model,
         delay=config.parsed_delay,
         integrator=integrator,

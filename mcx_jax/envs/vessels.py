@@ -78,19 +78,19 @@ def base_state(seg: Segment, i: jax.Array | int) -> tuple[Vec, Vec, Vec]:
 
 
 def goal_in_base(
-    seg_a: Segment, seg_b: Segment, goal_m: Vec, i: int | jax.Array
+    seg_a: Segment, seg_b: Segment, goal_m: jax.Array, i: int | jax.Array
 ) -> tuple[Mat, Vec]:
     """T_G^B = (R_B_G, p_B_G): the goal as seen from the arm's base at physics step i.
 
     Args:
-        goal_m: position of the goal on vessel B, m.
+        goal_m: (3,) position of the goal on vessel B, m.
     """
     xa, _, _ = seg_a.at(i)
     xb, _, _ = seg_b.at(i)
     r_a = rotation_rpy(xa[3], xa[4], xa[5])
     r_b = matmul(REST_B, rotation_rpy(xb[3], xb[4], xb[5]))
     p_b = vadd(REST_B_M, (xb[0], xb[1], xb[2]))
-    goal = vadd(p_b, matvec(r_b, goal_m))
+    goal = vadd(p_b, matvec(r_b, unpack(goal_m, 3)))
     to_base = transpose(r_a)
     return (
         matmul(matmul(to_base, r_b), GOAL_ROTATION),
@@ -98,17 +98,17 @@ def goal_in_base(
     )
 
 
-def goal_pose(motion: Motion, track: Track, goal_m: Vec, step: jax.Array) -> tuple[Mat, Vec]:
+def goal_pose(motion: Motion, track: Track, goal_m: jax.Array, step: jax.Array) -> tuple[Mat, Vec]:
     """T_G^B at a physics step counted from the episode's beginning."""
     seg_a = segment(motion.knots_a, track.table, track.start_a + step)
     seg_b = segment(motion.knots_b, track.table, track.start_b + step)
     return goal_in_base(seg_a, seg_b, goal_m, 0)
 
 
-def draw_goal(key: jax.Array) -> jax.Array:
-    """(3,) goal position on vessel B, m, uniform in its box."""
+def draw_goal(uniform: jax.Array) -> jax.Array:
+    """(3,) goal position on vessel B, m, from three uniform numbers in [0, 1)."""
     low, high = jnp.asarray(GOAL_LOW_M), jnp.asarray(GOAL_HIGH_M)
-    return jax.random.uniform(key, (3,), minval=low, maxval=high)
+    return low + (high - low) * uniform
 
 
 assert KNOT_STEPS % SUBSTEPS == 0 and math.isclose(KNOT_STEPS * 0.002, 0.1)

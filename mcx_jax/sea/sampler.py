@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from mcx_jax.config import PHYSICS_DT_S
 from mcx_jax.sea.tables import KNOT_DT_S, KNOT_STEPS
+from mcx_jax.spatial import sincos
 
 __all__ = ["KNOT_STEPS", "PHYSICS_DT_S", "body_rates", "hermite", "rotation_rpy", "segment_rows"]
 
@@ -84,7 +85,7 @@ def body_rates(
         w_body (3,) rad/s, al_body (3,) rad/s2: the time derivative of w_body, which is also the
         angular acceleration in the parent frame seen in body axes, since w x w = 0.
     """
-    sr, cr, sp, cp = jnp.sin(rpy[0]), jnp.cos(rpy[0]), jnp.sin(rpy[1]), jnp.cos(rpy[1])
+    (sr, cr), (sp, cp) = sincos(rpy[0]), sincos(rpy[1])
     dr, dp, dy = rpy_dot[0], rpy_dot[1], rpy_dot[2]
     ddr, ddp, ddy = rpy_ddot[0], rpy_ddot[1], rpy_ddot[2]
     w = (dr - dy * sp, dp * cr + dy * cp * sr, dy * cp * cr - dp * sr)
