@@ -21,7 +21,9 @@ FOLDER = "checkpoints"
 
 
 def save(run_dir: Path, iteration: int, state: Any) -> None:
-    """Write the state after `iteration` iterations; whole or not at all."""
+    """Write the state after `iteration` iterations; whole or not at all, and only once."""
+    if latest(run_dir) == iteration:
+        return
     args = _orbax().args
     items = args.Composite(
         state=args.StandardSave(_flatten(state)),

@@ -67,23 +67,28 @@ def _one_line(box: str) -> str:
     if match := re.search(r"Missing value for argument '(.*?)'", text):
         return f"{match[1]} needs a value"
     if match := re.search(r"Unrecognized options: (.*)", text):
-        near = re.search(r"│\s+(--[\w-]+)", box.split("Perhaps you meant")[-1])
-        hint = f"did you mean {near[1]}? " if "Perhaps you meant" in box and near else ""
+        near = re.search(r"Perhaps you meant:\W*(--[\w-]+)", box)
+        hint = f"did you mean {near[1]}? " if near else ""
         return f"unknown option {match[1].replace(',', '')}: {hint}--help lists all"
     return text or "the command line could not be read; --help explains it"
 
 
 def _box_text(box: str) -> str:
-    """Text of the box above its first rule, unwrapped."""
-    lines = []
+    """The message in tyro's box, unwrapped: what is between the title and the next rule.
+
+    Where the output takes no Unicode the box has no sides and the title is a line of its own.
+    """
+    sections = [[]]
     for line in box.splitlines():
-        inner = line.strip().strip("│╭╮╰╯").strip()
-        if line.lstrip().startswith(("╭", "╰")):
+        inner = line.strip().strip("│").strip()
+        if inner.startswith(("╭", "╰")):
             continue
-        if inner and set(inner) == {"─"}:
-            break
-        lines.append(inner)
-    return " ".join(" ".join(lines).split())
+        if inner and set(inner) <= set("─-"):
+            sections.append([])
+        else:
+            sections[-1].append(inner)
+    message = sections[0] if "╭" in box or len(sections) == 1 else sections[1]
+    return " ".join(" ".join(message).split())
 
 
 def value_of(argv: Sequence[str], flag: str) -> str | None:

@@ -39,18 +39,24 @@ def test_flags_are_flat():
         ("--seed -1", "--seed -1: must be 0 or a positive integer"),
         (
             "--num-envs 12",
-            "--num-envs 12 gives 12 sequences a window, which --minibatches 8 does not divide; "
-            "use a multiple of 8",
+            (
+                "--num-envs 12 gives 12 sequences a window, which --minibatches 8 does not divide; "
+                "use a multiple of 8"
+            ),
         ),
         (
             "--delay butter:4:25Hz",
-            "--delay butter:4:25Hz: the cutoff must be at least 0.1 Hz and below the Nyquist "
-            "frequency 25 Hz (control runs at 50 Hz)",
+            (
+                "--delay butter:4:25Hz: the cutoff must be at least 0.1 Hz and below the Nyquist "
+                "frequency 25 Hz (control runs at 50 Hz)"
+            ),
         ),
         (
             "--delay late",
-            "unknown delay 'late': use one of E0, E1, E2, B4_21, B4_4, E<k> for k control steps, "
-            "or butter:<order>:<cutoff>Hz, e.g. butter:4:7.5Hz",
+            (
+                "unknown delay 'late': use one of E0, E1, E2, B4_21, B4_4, E<k> for k control steps, "
+                "or butter:<order>:<cutoff>Hz, e.g. butter:4:7.5Hz"
+            ),
         ),
     ],
 )

@@ -1,0 +1,310 @@
+"""`python -m mcx_jax.train --delay D --num-envs N`: train a policy; see `--help`.
+
+Writes DIR/{config.json, metrics.jsonl, checkpoints/, policy.npz}. The command line is read and the
+directory checked before JAX is loaded, so that a mistake is told at once.
+"""
+
+import functools
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any, Literal, Self
+
+from mcx_jax import checkpoint, cli
+from mcx_jax.config import TrainConfig, preset_config
+from mcx_jax.progress import Progress, describe_device, short_time
+from mcx_jax.run_dir import POLICY, RunDir, default_path, open_existing, open_new, stored_config
+
+if TYPE_CHECKING:
+    from mcx_jax.policy import Policy
+    from mcx_jax.ppo.trainer import IterationMetrics, TrainState
+
+CHECKPOINT_INTERVAL_S = 60.0
+FINAL_EPISODES = 50
+SMOKE_EPISODES = 2
+SMOKE_ITERATIONS = 3
+
+
+@dataclass(frozen=True)
+class TrainCommand:
+    """Train a policy that corrects the arm's goal against the delay of its actuation."""
+
+    run_dir: str = ""
+    """Directory of the run; default runs/<delay>-<preset>-s<seed>."""
+    resume: bool = False
+    """Go on with the run in --run-dir from its last checkpoint, exactly as if never stopped."""
+    smoke: bool = False
+    """Try the whole path on a tiny run (a minute), in a temporary directory unless --run-dir."""
+    device: Literal["auto", "cpu", "gpu"] = "auto"
+    """Where to compute."""
+    train: TrainConfig = field(default_factory=TrainConfig)
+
+
+def smoke_config(config: TrainConfig) -> TrainConfig:
+    """A preset's defaults made tiny: 16 environments, 96-step episodes, three iterations."""
+    fast = config.preset == "fast"
+    window, episode = (32, 96) if fast else (96, 96)
+    ppo = replace(
+        config.ppo,
+        window_steps=window,
+        sequence_steps=window,
+        epochs=min(config.ppo.epochs, 4),
+        minibatches=2 if fast else 1,
+    )
+    env = replace(config.env, episode_steps=episode)
+    steps = SMOKE_ITERATIONS * 16 * window
+    return replace(config, num_envs=16, total_steps=steps, env=env, ppo=ppo)
+
+
+def read_command(argv: list[str]) -> tuple[TrainCommand, RunDir]:
+    """The command and its checked directory; nothing is written.
+
+    `--preset` and `--smoke` change the defaults of the other flags; with `--resume` the stored
+    configuration is the default, and a flag that contradicts it is refused.
+    """
+    defaults = preset_config(cli.value_of(argv, "--preset") or "fast")
+    if "--smoke" in argv:
+        defaults = smoke_config(defaults)
+    parse = functools.partial(cli.parse, TrainCommand, argv, prog="train")
+    command = parse(default=TrainCommand(train=defaults))
+    if not command.resume:
+        return command, open_new(_directory(command), command.train)
+    path = Path(command.run_dir) if command.run_dir else default_path(command.train)
+    command = parse(default=TrainCommand(train=stored_config(path)))
+    return command, open_existing(path, command.train)
+
+
+def _directory(command: TrainCommand) -> Path:
+    if command.run_dir:
+        return Path(command.run_dir)
+    if command.smoke:
+        return Path(tempfile.mkdtemp(prefix="mcx_jax-smoke-"))
+    return default_path(command.train)
+
+
+@dataclass
+class StopRequest:
+    """Turns the first SIGINT or SIGTERM into a request; the second acts as usual."""
+
+    signum: int = 0
+    previous: dict[int, Any] = field(default_factory=dict)
+
+    def __enter__(self) -> Self:
+        """Listen."""
+        for signum in (signal.SIGINT, signal.SIGTERM):
+            self.previous[signum] = signal.signal(signum, self._note)
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        """Give the signals back."""
+        for signum, handler in self.previous.items():
+            signal.signal(signum, handler)
+
+    def _note(self, signum: int, frame: FrameType | None) -> None:
+        del frame
+        self.signum = signum
+        signal.signal(signum, self.previous[signum])
+        print("\nstopping at the end of this iteration (again: at once)", flush=True)
+
+
+def start(run: RunDir, env: Any) -> "TrainState":
+    """The state to begin with: new, or the last checkpoint's. A seed axis if --seeds > 1."""
+    import jax
+
+    from mcx_jax.ppo.trainer import init, init_seeds
+
+    config = run.config
+    if config.seeds > 1:
+        keys = jax.vmap(jax.random.key)(jax.numpy.arange(config.seed, config.seed + config.seeds))
+        first = jax.jit(init_seeds, static_argnums=0)
+    else:
+        keys, first = jax.random.key(config.seed), jax.jit(init, static_argnums=0)
+    if run.start_iteration:
+        return checkpoint.restore_latest(run.path, jax.eval_shape(first, config, env, keys))
+    return first(config, env, keys)
+
+
+def compile_iteration(config: TrainConfig, env: Any, state: "TrainState") -> Callable[..., Any]:
+    """The compiled iteration, (env, state) -> (state, metrics); it consumes the old state."""
+    import jax
+
+    from mcx_jax.ppo.trainer import train_iteration, train_iteration_seeds
+
+    iteration = train_iteration_seeds if config.seeds > 1 else train_iteration
+    jitted = jax.jit(iteration, static_argnums=0, donate_argnums=2)
+    return jitted.lower(config, env, state).compile()
+
+
+def metric_rows(
+    config: TrainConfig, iteration: int, metrics: "IterationMetrics"
+) -> list[dict[str, Any]]:
+    """Rows of metrics.jsonl: one per seed."""
+    import jax
+    import numpy as np
+
+    names = metrics.__dataclass_fields__
+    values = {name: np.atleast_1d(jax.device_get(getattr(metrics, name))) for name in names}
+    return [
+        {
+            "iteration": iteration,
+            "steps": iteration * config.steps_per_iteration,
+            "seed": config.seed + k,
+            **{name: float(value[k]) for name, value in values.items()},
+        }
+        for k in range(config.seeds)
+    ]
+
+
+def policies_of(config: TrainConfig, state: "TrainState") -> "list[Policy]":
+    """The policy of every seed."""
+    import jax
+
+    from mcx_jax.policy import Policy, PolicyMeta
+
+    arrays = (state.learner.policy.params, state.obs_stats, state.iteration)
+    if config.seeds == 1:
+        arrays = jax.tree.map(lambda x: x[None], arrays)
+    actions = arrays[0]["params"]["raw_sigma"].shape[-1]
+
+    def policy(k: int) -> Policy:
+        params, stats, iteration = jax.tree.map(lambda x: x[k], arrays)
+        meta = PolicyMeta(
+            obs_size=stats.mean.shape[-1],
+            action_size=actions,
+            hidden=config.ppo.hidden,
+            config=cli.config_to_json(config),
+            iteration=int(iteration),
+            seed=config.seed + k,
+        )
+        return Policy(params, stats, meta)
+
+    return [policy(k) for k in range(config.seeds)]
+
+
+def save(run: RunDir, state: "TrainState", rows: list[dict[str, Any]]) -> "tuple[Policy, int]":
+    """Checkpoint and policy files; policy.npz is the best seed by reward of the last iteration.
+
+    Returns:
+        The best policy, and its seed.
+    """
+    from mcx_jax.policy import save_policy
+
+    policies = policies_of(run.config, state)
+    best = max(range(len(policies)), key=lambda k: rows[k]["reward"] if rows else 0.0)
+    if len(policies) > 1:
+        for policy in policies:
+            save_policy(run.path / f"policy_s{policy.meta.seed}.npz", policy)
+    save_policy(run.path / POLICY, policies[best])
+    checkpoint.save(run.path, policies[0].meta.iteration, state)
+    return policies[best], policies[best].meta.seed
+
+
+def iterate(
+    run: RunDir, env: Any, compiled: Callable[..., Any], state: "TrainState", stop: StopRequest
+) -> "Policy":
+    """Train to the end, or to the first iteration after a request to stop.
+
+    Returns:
+        The policy that was saved last.
+    """
+    config, progress = run.config, Progress(run.config, run.start_iteration)
+    saved = time.monotonic()
+    rows = run.last_rows()
+    for iteration in range(run.start_iteration + 1, config.iterations + 1):
+        state, metrics = compiled(env, state)
+        rows = metric_rows(config, iteration, metrics)
+        run.append([{**row, "wall_s": time.monotonic() - progress.begun} for row in rows])
+        progress.show(rows)
+        if stop.signum:
+            break
+        if time.monotonic() - saved > CHECKPOINT_INTERVAL_S:
+            save(run, state, rows)
+            saved = time.monotonic()
+    policy, seed = save(run, state, rows)
+    if config.seeds > 1:
+        print(f"{run.path / POLICY}: seed {seed}, the best of {config.seeds} by training reward")
+    return policy
+
+
+def train(run: RunDir, make_env: Callable[..., Any]) -> "Policy":
+    """Build the environment, compile, and train.
+
+    Args:
+        make_env: (env_config, motion_config, split="train") -> environment.
+
+    Raises:
+        UserError: the arm, the motion or the checkpoint cannot be used.
+        SystemExit: stopped by a signal, after saving.
+    """
+    config = run.config
+    begun = time.monotonic()
+    env = make_env(config.env, config.motion, split="train")
+    state = start(run, env)
+    ready = time.monotonic()
+    compiled = compile_iteration(config, env, state)
+    print(
+        f"set-up {short_time(ready - begun)}, compile {short_time(time.monotonic() - ready)}; "
+        f"{config.iterations} iterations of {config.num_envs} x {config.ppo.window_steps} steps",
+        flush=True,
+    )
+    run.create()
+    if run.start_iteration:
+        print(f"going on after iteration {run.start_iteration}")
+    with StopRequest() as stop:
+        policy = iterate(run, env, compiled, state, stop)
+    if stop.signum and policy.meta.iteration < config.iterations:
+        print(f"saved; go on with: python -m mcx_jax.train --run-dir {run.path} --resume")
+        raise SystemExit(128 + stop.signum)
+    return policy
+
+
+def final_table(config: TrainConfig, policy: "Policy", episodes: int) -> None:
+    """Evaluate the policy beside the IK baseline on test motion and print the table."""
+    from mcx_jax.controllers import CLASSICAL
+    from mcx_jax.evaluate import evaluate, print_table
+    from mcx_jax.policy import PolicyController
+
+    named = config.motion.sea in ("all", "Wa", "Wb", "Wc", "Wd")
+    motion = replace(config.motion, sea="all") if named else config.motion
+    baseline = evaluate("ik", CLASSICAL["ik"], config.env, motion, episodes=episodes)
+    rows = evaluate(
+        "policy",
+        PolicyController(policy),
+        config.env,
+        motion,
+        episodes=episodes,
+        baseline=baseline,
+    )
+    print_table(baseline + rows)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Command line."""
+    from mcx_jax import startup
+
+    command, run = read_command(list(sys.argv[1:] if argv is None else argv))
+    for line in startup.configure(command.device):
+        print(line)
+    print(describe_device())
+    print(run.config.env.parsed_delay.describe())
+    print(f"run directory: {run.path}", flush=True)
+    from mcx_jax.envs.v2v import make_env
+
+    try:
+        policy = train(run, make_env)
+    except KeyboardInterrupt:
+        print("\nstopped before the end of an iteration; go on with --resume if a run had begun")
+        raise SystemExit(130) from None
+    final_table(run.config, policy, SMOKE_EPISODES if command.smoke else FINAL_EPISODES)
+    print(f"done: {run.path / POLICY}")
+
+
+if __name__ == "__main__":
+    from mcx_jax.startup import run_command
+
+    run_command(main)

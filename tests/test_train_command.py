@@ -1,0 +1,267 @@
+"""`python -m mcx_jax.train`: mistakes before anything is written, and exact resuming.
+
+Training runs on a probe environment here; the whole path with the real one is the smoke test.
+"""
+
+import json
+import os
+import signal
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from probe_envs import make_probe
+
+from mcx_jax import checkpoint, cli, startup
+from mcx_jax.config import EnvConfig, TrainConfig, preset_config
+from mcx_jax.errors import UserError
+from mcx_jax.policy import load_policy
+from mcx_jax.progress import Progress, short_time
+from mcx_jax.run_dir import default_path, open_existing, open_new
+from mcx_jax.train import StopRequest, main, read_command, start, train
+
+CONFIG = replace(
+    preset_config("fast"),
+    num_envs=8,
+    total_steps=8 * 8 * 4,
+    env=EnvConfig(episode_steps=16),
+    ppo=replace(
+        preset_config("fast").ppo, window_steps=8, sequence_steps=4, minibatches=2, hidden=8
+    ),
+)
+
+
+def _make_env(env_config, motion_config, split):
+    assert split == "train"
+    return make_probe(scale=0.01)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A run of four iterations that was not interrupted."""
+    path = tmp_path_factory.mktemp("finished") / "run"
+    train(open_new(path, CONFIG), _make_env)
+    return path
+
+
+def _contents(path):
+    return {p: p.read_bytes() for p in sorted(path.rglob("*")) if p.is_file()}
+
+
+def _state(path, config):
+    return start(open_existing(path, config), make_probe(scale=0.01))
+
+
+def _assert_same_run(one, other, config):
+    rows = [
+        [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+        for path in (one, other)
+    ]
+    for row in rows[0] + rows[1]:
+        row.pop("wall_s")
+    assert rows[0] == rows[1]
+    a, b = _state(one, config), _state(other, config)
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        if jax.numpy.issubdtype(x.dtype, jax.dtypes.prng_key):
+            x, y = jax.random.key_data(x), jax.random.key_data(y)
+        np.testing.assert_array_equal(x, y)
+
+
+def test_what_a_run_writes(finished, capsys):
+    names = sorted(p.name for p in finished.iterdir())
+    assert names == ["checkpoints", "config.json", "metrics.jsonl", "policy.npz"]
+    stored = cli.config_from_json(TrainConfig, (finished / "config.json").read_text())
+    assert stored == CONFIG
+    rows = [json.loads(line) for line in (finished / "metrics.jsonl").read_text().splitlines()]
+    assert [row["iteration"] for row in rows] == [1, 2, 3, 4]
+    assert [row["steps"] for row in rows] == [64, 128, 192, 256]
+    assert {"seed", "pos_error_mm", "ang_error_mrad", "kl", "sigma", "wall_s"} <= set(rows[0])
+    assert load_policy(finished / "policy.npz").meta.iteration == 4
+
+
+def test_stopped_and_resumed_is_never_stopped(finished, tmp_path, monkeypatch, capsys):
+    show = Progress.show
+
+    def show_and_interrupt(self, rows):
+        show(self, rows)
+        if rows[0]["iteration"] == 2:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    path = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(Progress, "show", show_and_interrupt)
+        with pytest.raises(SystemExit) as stop:
+            train(open_new(path, CONFIG), _make_env)
+    assert stop.value.code == 128 + signal.SIGTERM
+    assert checkpoint.latest(path) == 2
+    assert f"--run-dir {path} --resume" in capsys.readouterr().out
+    # A row after the checkpoint, and one cut short, as a killed process leaves them.
+    with (path / "metrics.jsonl").open("a") as file:
+        file.write('{"iteration": 3, "wall_s": 0.0}\n{"iterat')
+    train(open_existing(path, CONFIG), _make_env)
+    _assert_same_run(path, finished, CONFIG)
+
+
+def test_killed_before_the_first_checkpoint_starts_again(finished, tmp_path):
+    path = tmp_path / "run"
+    run = open_new(path, CONFIG)
+    run.create()
+    run.append([{"iteration": 1}])
+    train(open_existing(path, CONFIG), _make_env)
+    _assert_same_run(path, finished, CONFIG)
+
+
+def test_several_seeds(tmp_path, capsys):
+    path, config = tmp_path / "run", replace(CONFIG, seeds=2, seed=5)
+    policy = train(open_new(path, config), _make_env)
+    rows = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+    assert [(row["iteration"], row["seed"]) for row in rows] == [
+        (i, s) for i in range(1, 5) for s in (5, 6)
+    ]
+    best = max(rows[-2:], key=lambda row: row["reward"])["seed"]
+    assert policy.meta.seed == best
+    assert load_policy(path / "policy.npz").meta.seed == best
+    assert {load_policy(path / f"policy_s{s}.npz").meta.seed for s in (5, 6)} == {5, 6}
+    assert f"seed {best}, the best of 2 by training reward" in capsys.readouterr().out
+    before = _contents(path)
+    train(open_existing(path, config), _make_env)  # finished: nothing left to do
+    assert set(_contents(path)) == set(before)
+
+
+def _refused(argv, capsys):
+    """Exit code 2 and one line on stderr; returns the line."""
+    with pytest.raises(SystemExit) as stop:
+        startup.run_command(lambda: main(argv))
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and error.count("\n") == 1
+    return error.removeprefix("error: ").strip()
+
+
+@pytest.fixture
+def finished_default(tmp_path):
+    """A directory that looks like a finished run of `--num-envs 64 --total-steps 4096`."""
+    path = tmp_path / "done"
+    config = replace(preset_config("fast"), num_envs=64, total_steps=4096)
+    open_new(path, config).create()
+    (path / "checkpoints" / str(config.iterations)).mkdir(parents=True)
+    return path
+
+
+SAME = ["--num-envs", "64", "--total-steps", "4096"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (SAME, "{path}: holds a finished run; name another directory with --run-dir"),
+        (
+            [*SAME, "--seed", "1"],
+            "{path}: holds a run with --seed 0, not 1; name another directory",
+        ),
+        (
+            [*SAME, "--delay", "E2"],
+            "{path}: holds a run with --delay B4_4, not E2; name another directory",
+        ),
+        (
+            ["--resume", "--delay", "E2"],
+            "{path}: holds a run with --delay B4_4, not E2; name another directory",
+        ),
+    ],
+)
+def test_nothing_is_written_over(flags, message, finished_default, capsys):
+    before = _contents(finished_default)
+    said = _refused([*flags, "--run-dir", str(finished_default)], capsys)
+    assert said == message.format(path=finished_default)
+    assert _contents(finished_default) == before
+
+
+def test_unfinished_run_asks_for_resume(finished_default, capsys):
+    (finished_default / "checkpoints" / "2").rename(finished_default / "checkpoints" / "1")
+    said = _refused([*SAME, "--run-dir", str(finished_default)], capsys)
+    assert said == (
+        f"{finished_default}: holds an unfinished run; go on with --resume, or name another "
+        "--run-dir"
+    )
+
+
+def test_strange_directories(tmp_path, capsys):
+    (tmp_path / "notes.txt").write_text("mine")
+    flags = ["--run-dir", str(tmp_path)]
+    assert _refused(flags, capsys) == (
+        f"--run-dir {tmp_path}: holds other files; name an empty or a new directory"
+    )
+    assert _refused([*flags, "--resume"], capsys) == (
+        f"{tmp_path}: no run to go on with here (config.json is missing)"
+    )
+    file = tmp_path / "notes.txt"
+    assert _refused(["--run-dir", str(file)], capsys) == (
+        f"--run-dir {file}: is a file; name a directory"
+    )
+    (tmp_path / "config.json").write_text("{")
+    assert _refused(flags, capsys) == (f"{tmp_path / 'config.json'}: not a JSON file, or cut short")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["config.json", "notes.txt"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ("--preset slow", "unknown preset 'slow': use fast or paper"),
+        ("--total-steps 0", "--total-steps 0: must be a positive integer"),
+        ("--algo sac", "--algo sac: use one of ppo"),
+        ("--device tpu", "--device tpu: use one of auto, cpu, gpu"),
+        ("--resum", "unknown option --resum: did you mean --resume? --help lists all"),
+        ("--num-envs 2.5", "--num-envs 2.5: must be a whole number"),
+    ],
+)
+def test_mistakes_in_flags(flags, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert _refused(flags.split(), capsys) == message
+    assert not list(tmp_path.iterdir())
+
+
+def test_preset_and_smoke_change_the_defaults(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    command, run = read_command(["--preset", "paper", "--gamma", "0.98"])
+    assert command.train.ppo.epochs == 80 and command.train.ppo.gamma == 0.98
+    assert command.train.num_envs == 8 and str(run.path) == "runs/B4_4-paper-s0"
+    command, run = read_command(["--smoke", "--num-envs", "8", "--physics", "mjx"])
+    assert command.train.num_envs == 8 and command.train.env.physics == "mjx"
+    assert command.train.iterations <= 6 and not run.path.is_relative_to(tmp_path)
+    command, _ = read_command(["--smoke", "--preset", "paper"])
+    assert command.train.ppo.window_steps == command.train.env.episode_steps == 96
+    assert not list(tmp_path.iterdir())
+
+
+def test_resume_reads_the_stored_configuration(finished_default):
+    command, run = read_command(["--resume", "--run-dir", str(finished_default)])
+    assert command.train.num_envs == 64 and run.start_iteration == 2
+
+
+def test_default_directory():
+    config = preset_config("fast")
+    assert str(default_path(replace(config, seed=3))) == "runs/B4_4-fast-s3"
+    assert str(default_path(replace(config, seed=3, seeds=4))) == "runs/B4_4-fast-s3-6"
+    literal = replace(config, env=replace(config.env, delay="butter:4:7.5Hz"))
+    assert str(default_path(literal)) == "runs/butter_4_7.5Hz-fast-s0"
+
+
+def test_second_signal_acts_as_usual():
+    with StopRequest() as stop:
+        os.kill(os.getpid(), signal.SIGINT)
+        assert stop.signum == signal.SIGINT
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGINT)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_short_time():
+    assert [short_time(s) for s in (12.4, 200, 3900)] == ["12 s", "3 min 20 s", "1 h 05 min"]
+
+
+def test_restored_checkpoint_of_another_size_is_refused(finished, tmp_path):
+    config = replace(CONFIG, num_envs=16)
+    like = start(open_new(tmp_path / "other", config), make_probe())
+    with pytest.raises(UserError, match="cannot be restored"):
+        checkpoint.restore_latest(finished, like)
