@@ -1,0 +1,101 @@
+"""Error statistics by hand, and the published table."""
+
+import numpy as np
+import pytest
+
+from mcx_jax import results
+from mcx_jax.paper import table3
+
+SEAS, DELAYS = ("Wa", "Wb", "Wc", "Wd"), ("E0", "E1", "E2", "B4_21", "B4_4")
+
+
+def test_statistics_by_hand():
+    # 1..100: mean 50.5, variance (100^2 - 1) / 12 = 833.25, std 28.8661; worst 5 %: 96..100, mean
+    # 98; worst 1 %: 100.
+    points = np.random.default_rng(0).permutation(np.arange(1.0, 101.0)).reshape(20, 5)
+    got = results.error_statistics(points)
+    assert got["mean"] == pytest.approx(50.5, rel=1e-12)
+    assert got["std"] == pytest.approx(28.86607, rel=1e-6)
+    assert (got["top5"], got["top1"], got["max"]) == (98.0, 100.0, 100.0)
+    assert all(type(value) is float for value in got.values())  # what json writes
+
+
+@pytest.mark.parametrize(
+    ("count", "top5", "top1"),
+    [
+        # 1..n; the share is rounded up, and is one point at least.
+        (1, 1.0, 1.0),
+        (10, 10.0, 10.0),  # 0.5 points: one
+        (20, 20.0, 20.0),  # exactly one
+        (21, 20.5, 21.0),  # 1.05: two, (21 + 20) / 2
+        (101, 98.5, 100.5),  # 5.05: six, 96..101; 1.01: two, (101 + 100) / 2
+    ],
+)
+def test_shares_are_rounded_up(count, top5, top1):
+    got = results.error_statistics(np.arange(1.0, count + 1)[:, None])
+    assert got["top5"] == pytest.approx(top5, rel=1e-12)
+    assert got["top1"] == pytest.approx(top1, rel=1e-12)
+
+
+def test_statistics_sum_in_float64():
+    # 50 episodes of 950 steps in float32: naive sums lose the fifth digit.
+    got = results.error_statistics(np.full((950, 50), np.float32(0.1)))
+    assert got["mean"] == pytest.approx(float(np.float32(0.1)), rel=1e-12)
+    assert got["std"] < 1e-12
+
+
+def test_row_drops_the_first_second_and_changes_units():
+    steps = results.WARM_UP_STEPS + 4
+    pos_m = np.full((steps, 2), 99.0)
+    pos_m[-4:] = [[1e-3, 2e-3], [3e-3, 4e-3], [5e-3, 6e-3], [7e-3, 8e-3]]
+    row = results.row("ik", "E1", "Wb", pos_m, 2 * pos_m, np.array([True, False]))
+    assert results.WARM_UP_STEPS == 50  # paper
+    assert row["pos_mm"]["mean"] == pytest.approx(4.5, rel=1e-12)
+    assert row["pos_mm"]["max"] == pytest.approx(8.0, rel=1e-12)
+    assert row["ang_mrad"]["mean"] == pytest.approx(9.0, rel=1e-12)
+    assert (row["who"], row["delay"], row["sea"]) == ("ik", "E1", "Wb")
+    assert (row["episodes"], row["invalid_episodes"]) == (2, 1)
+
+
+def test_improvement_by_hand():
+    ours = {"mean": 1.0, "std": 9.0, "top5": 2.0, "top1": 6.0, "max": 12.0}
+    base = {"mean": 4.0, "std": 1.0, "top5": 4.0, "top1": 6.0, "max": 8.0}
+    want = {"all": 0.75, "top5": 0.5, "top1": 0.0, "max": -0.5}
+    assert results.improvement(ours, base) == want
+
+
+def test_improvement_is_over_the_baseline_of_the_same_sea():
+    def one(sea, scale):
+        stats = dict.fromkeys(("mean", "std", "top5", "top1", "max"), scale)
+        return {"sea": sea, "pos_mm": stats, "ang_mrad": {k: 3 * v for k, v in stats.items()}}
+
+    rows = [one("Wa", 1.0), one("Wd", 1.0)]
+    results.add_improvement(rows, [one("Wd", 4.0), one("Wa", 2.0)])
+    assert rows[0]["improvement"]["pos"]["all"] == pytest.approx(0.5)
+    assert rows[1]["improvement"]["ang"]["max"] == pytest.approx(0.75)
+
+
+def test_table3_is_complete_and_consistent():
+    table = table3()
+    assert set(table) == {(delay, sea) for delay in DELAYS for sea in SEAS}
+    for cell in table.values():
+        for name, share in (("pos_mm", "pos_imp_all"), ("ang_mrad", "ang_imp_all")):
+            implied = cell[f"{name}_mean"] / (1 - cell[share])
+            # The file gives two decimals.
+            assert cell[f"ik_{name}_implied"] == pytest.approx(implied, abs=0.0051)
+
+
+def test_table3_by_hand():
+    # E0 in Wa: 0.39 mm at an improvement of 58 %: 0.39 / 0.42 = 0.93 mm; 0.50 / 0.35 = 1.43 mrad.
+    assert results.paper_errors("ik", "E0", "Wa") == (0.93, 1.43)
+    assert results.paper_errors("some/run", "E0", "Wa") == (0.39, 0.50)
+    assert results.paper_errors("ik", "B4_4", "Wd") == (8.08, 5.39)
+    assert results.paper_errors("ik", "E7", "Wa") is None
+    assert results.paper_errors("ik", "E0", "1.5:8") is None
+
+
+def test_paper_errors_grow_with_the_sea():
+    for delay in DELAYS:
+        for column in ("pos_mm_mean", "ang_mrad_mean", "ik_pos_mm_implied", "ik_ang_mrad_implied"):
+            values = [table3()[delay, sea][column] for sea in SEAS]
+            assert values == sorted(values), (delay, column)
