@@ -18,7 +18,14 @@ START_POSE_RAD = (-0.1, -1.0, 2.4, -2.9, -1.5, 0.0)
 REACH_POSE_RAD = (-0.271, -1.3039, 2.2268, -2.4937, -1.5708, -0.271)
 """Joint angles (6,) that put the tool on the goal of the scene's rest pose, for still pictures."""
 
-SEA_COMPONENTS = ((2.9, 0.25, 0.30), (1.9, -0.45, 0.26), (1.1, 0.9, 0.20), (0.7, -0.1, 0.13))
+SEA_COMPONENTS = (
+    (2.9, 0.25, 0.26),
+    (1.9, -0.45, 0.22),
+    (1.1, 0.9, 0.16),
+    (0.8, 2.0, 0.12),
+    (0.55, 0.5, 0.09),
+    (0.42, -0.9, 0.07),
+)
 """Decoration, not a sea state: (length m, direction rad, weight) of the drawn surface's waves."""
 
 
@@ -33,6 +40,8 @@ def build_scene(arm: str | Path | None = None) -> mujoco.MjModel:
     """
     scene = mujoco.MjSpec.from_file(str(asset_path("scene.xml")))
     child = mujoco.MjSpec.from_file(str(arm or asset_path("ur10e_paper.xml")))
+    # Nothing is integrated here, and options that differ would make `attach` warn.
+    scene.option = child.option
     scene.attach(child, site=scene.site("mount"), prefix="arm/")
     sea = scene.hfield("sea")
     sea.userdata = _drawn_sea(sea.nrow, sea.ncol, 2 * sea.size[0]).ravel()
