@@ -9,9 +9,8 @@ import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import numpy as np
 import tyro
 
 from mcx_jax.config import EnvConfig, MotionConfig
@@ -120,11 +119,19 @@ def evaluate(
 
     Returns:
         One row a sea, as described in the README (section Evaluate).
+
+    Raises:
+        UserError: episodes that end within the warm-up.
     """
     from mcx_jax.controllers import IK
     from mcx_jax.envs.v2v import make_env
-    from mcx_jax.results import add_improvement, row
+    from mcx_jax.results import WARM_UP_STEPS, add_improvement, row
 
+    if env_config.episode_steps <= WARM_UP_STEPS:
+        raise UserError(
+            f"--episode-steps {env_config.episode_steps}: the first {WARM_UP_STEPS} steps are not "
+            f"counted; evaluate at least {WARM_UP_STEPS + 1}"
+        )
     env = make_env(env_config, motion_config, split="test")
 
     def rows_of(name, ctrl):
