@@ -126,7 +126,7 @@ def start(run: RunDir, env: Any) -> "TrainState":
         keys, first = jax.random.key(config.seed), jax.jit(init, static_argnums=0)
     if run.start_iteration:
         return checkpoint.restore_latest(run.path, jax.eval_shape(first, config, env, keys))
-    return first(config, env, keys)
+    return jax.block_until_ready(first(config, env, keys))
 
 
 def compile_iteration(config: TrainConfig, env: Any, state: "TrainState") -> Callable[..., Any]:

@@ -140,6 +140,17 @@ def test_seeds_in_one_call_are_the_single_seeds():
     assert float(metrics.reward[0]) != float(metrics.reward[1])
 
 
+def test_no_lapack():
+    """jaxlib's batched LAPACK calls can wait for each other for ever (see `lstm`), so there must be
+    none in a program of several seeds."""
+    env, keys = make_probe(), jax.random.split(jax.random.key(5), 2)
+    first = jax.jit(trainer.init_seeds, static_argnums=0)
+    states = jax.eval_shape(first, CONFIG, env, keys)
+    iteration = jax.jit(trainer.train_iteration_seeds, static_argnums=0)
+    for lowered in (first.lower(CONFIG, env, keys), iteration.lower(CONFIG, env, states)):
+        assert "lapack" not in lowered.as_text()
+
+
 def test_blocks_cover_all_environments():
     """G = 4 windows, 10 environments: blocks of 3 that start at 0, 2, 5, 7; N = 2 < G too."""
     nets = trainer.networks_of(CONFIG.ppo, 2)
