@@ -24,11 +24,9 @@ def save(run_dir: Path, iteration: int, state: Any) -> None:
     """Write the state after `iteration` iterations; whole or not at all, and only once."""
     if latest(run_dir) == iteration:
         return
-    args = _orbax().args
-    items = args.Composite(
-        state=args.StandardSave(_flatten(state)),
-        meta=args.JsonSave({"format": FORMAT, "iteration": iteration}),
-    )
+    args, flat = _orbax().args, _flatten(state)
+    meta = {"format": FORMAT, "iteration": iteration, "leaves": _types(flat)}
+    items = args.Composite(state=args.StandardSave(flat), meta=args.JsonSave(meta))
     with _manager(run_dir) as manager:
         manager.save(iteration, args=items, force=True)
         manager.wait_until_finished()
@@ -55,17 +53,45 @@ def restore_latest(run_dir: Path, like: Any) -> Any:
     if iteration is None:
         raise UserError(f"{run_dir}: no checkpoint to go on from; start without --resume")
     where = f"{run_dir / FOLDER / str(iteration)}"
-    _check_format(Path(where))
     wanted = _flatten(like)
+    _check(where, _meta(Path(where)), _types(wanted))
     args = _orbax().args
     try:
         with _manager(run_dir) as manager:
             items = args.Composite(state=args.StandardRestore(wanted))
             stored = manager.restore(iteration, args=items).state
-    except (ValueError, KeyError, OSError) as error:
-        reason = str(error).strip().splitlines()[0][:120] if str(error).strip() else "unknown"
+    except (ValueError, KeyError, OSError, TypeError) as error:
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:120]
         raise UserError(f"{where}: cannot be restored ({reason})") from None
     return _unflatten(like, stored)
+
+
+def _types(flat: dict[str, Any]) -> dict[str, str]:
+    """Type and shape of every leaf, like float32[3, 4]."""
+    return {path: f"{leaf.dtype}{list(leaf.shape)}" for path, leaf in flat.items()}
+
+
+def _meta(folder: Path) -> dict[str, Any]:
+    try:
+        meta = json.loads((folder / "meta" / "metadata").read_text())
+        return {"format": meta["format"], "leaves": meta.get("leaves", {})}
+    except (OSError, ValueError, KeyError, AttributeError, TypeError):
+        raise UserError(f"{folder}: not a checkpoint of mcx_jax, or damaged") from None
+
+
+def _check(where: str, meta: dict[str, Any], wanted: dict[str, str]) -> None:
+    """Refuse what does not fit before orbax starts to read."""
+    if meta["format"] != FORMAT:
+        raise UserError(
+            f"{where}: checkpoint of format {meta['format']}; this version reads {FORMAT}"
+        )
+    found = meta["leaves"]
+    for path in sorted({*wanted, *found}):
+        ours, theirs = wanted.get(path, "nothing"), found.get(path, "nothing")
+        if ours != theirs:
+            raise UserError(
+                f"{where}: cannot be restored: {path} is {theirs} there and {ours} here"
+            )
 
 
 def _orbax() -> Any:
@@ -80,15 +106,6 @@ def _manager(run_dir: Path) -> Any:
     ocp = _orbax()
     options = ocp.CheckpointManagerOptions(max_to_keep=KEEP, enable_async_checkpointing=False)
     return ocp.CheckpointManager((run_dir / FOLDER).absolute(), options=options)
-
-
-def _check_format(folder: Path) -> None:
-    try:
-        found = json.loads((folder / "meta" / "metadata").read_text())["format"]
-    except (OSError, ValueError, KeyError):
-        raise UserError(f"{folder}: not a checkpoint of mcx_jax, or damaged") from None
-    if found != FORMAT:
-        raise UserError(f"{folder}: checkpoint of format {found}; this version reads {FORMAT}")
 
 
 def _is_key(leaf: Any) -> bool:

@@ -76,7 +76,7 @@ def test_unfinished_checkpoint_is_not_taken(tmp_path):
 def test_of_another_format(tmp_path):
     checkpoint.save(tmp_path, 2, _state())
     meta = tmp_path / "checkpoints" / "2" / "meta" / "metadata"
-    assert json.loads(meta.read_text()) == {"format": 1, "iteration": 2}
+    assert json.loads(meta.read_text())["format"] == 1
     meta.write_text(json.dumps({"format": 9}))
     with pytest.raises(UserError, match="checkpoint of format 9; this version reads 1"):
         checkpoint.restore_latest(tmp_path, _state())
@@ -87,12 +87,16 @@ def test_of_another_format(tmp_path):
 
 def test_of_another_shape(tmp_path):
     checkpoint.save(tmp_path, 2, _state())
-    other = _state().replace(count=jnp.zeros((7,), jnp.int32))
-    with pytest.raises(UserError, match="cannot be restored"):
-        checkpoint.restore_latest(tmp_path, other)
-    other = _state().replace(absent=jnp.zeros(3))
-    with pytest.raises(UserError, match="cannot be restored"):
-        checkpoint.restore_latest(tmp_path, other)
+    where = f"{tmp_path / 'checkpoints' / '2'}: cannot be restored: "
+    for change, message in [
+        ({"count": jnp.zeros((7,), jnp.int32)}, ".count is int32[] there and int32[7] here"),
+        ({"flag": jnp.zeros(())}, ".flag is bool[] there and float32[] here"),
+        ({"absent": jnp.zeros(3)}, ".absent is nothing there and float32[3] here"),
+        ({"count": None}, ".count is int32[] there and nothing here"),
+    ]:
+        with pytest.raises(UserError) as error:
+            checkpoint.restore_latest(tmp_path, _state().replace(**change))
+        assert str(error.value) == where + message
 
 
 def test_damaged(tmp_path):
