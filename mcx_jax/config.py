@@ -4,6 +4,7 @@ The command lines are generated from these dataclasses (`mcx_jax.cli`), so a fie
 its help text. Derived values are properties. All classes are hashable: they are static under jit.
 """
 
+import math
 import re
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -54,7 +55,8 @@ class Delay:
                 f"{self.name}: Butterworth order {self.order}, cutoff {self.cutoff_hz:g} Hz, "
                 f"group delay {1e3 * self.group_delay_s:.1f} ms at 0 Hz"
             )
-        return f"{self.name}: explicit delay of {self.steps} control steps = {1e3 * self.group_delay_s:.0f} ms"
+        milliseconds = 1e3 * self.group_delay_s
+        return f"{self.name}: explicit delay of {self.steps} control steps = {milliseconds:.0f} ms"
 
 
 def _butter_dc_group_delay_s(order: int, cutoff_hz: float) -> float:
@@ -65,8 +67,6 @@ def _butter_dc_group_delay_s(order: int, cutoff_hz: float) -> float:
     """
     if order == 0:
         return 0.0
-    import math
-
     wc = 2.0 / CONTROL_DT_S * math.tan(math.pi * cutoff_hz * CONTROL_DT_S)
     angles = [math.pi * (2 * k + 1) / (2 * order) for k in range(order)]
     return sum(math.sin(angle) for angle in angles) / wc
@@ -184,9 +184,17 @@ class PPOConfig:
             "policy-lr": self.policy_lr,
             "value-lr": self.value_lr,
             "initial-sigma": self.initial_sigma,
+            "clip": self.clip,
+            "target-kl": self.target_kl,
+            "reject-mean-sq-reward": self.reject_mean_sq_reward,
         }
         for name, value in positive.items():
-            _require(value > 0, f"--{name} {value}: must be positive")
+            _require(0 < value < math.inf, f"--{name} {value}: must be positive")
+        for name, value in {
+            "entropy-coef": self.entropy_coef,
+            "max-grad-norm": self.max_grad_norm,
+        }.items():
+            _require(0 <= value < math.inf, f"--{name} {value}: must be 0 or positive")
         _require(0 < self.gamma <= 1, f"--gamma {self.gamma}: must be above 0 and at most 1")
         _require(0 <= self.gae_lambda <= 1, f"--gae-lambda {self.gae_lambda}: must be 0 to 1")
         _require(

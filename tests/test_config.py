@@ -148,6 +148,18 @@ REFUSED = {
     "policy rate": (lambda: PPOConfig(policy_lr=0.0), "--policy-lr 0.0: must be positive"),
     "value rate": (lambda: PPOConfig(value_lr=math.nan), "--value-lr nan: must be positive"),
     "sigma": (lambda: PPOConfig(initial_sigma=-0.3), "--initial-sigma -0.3: must be positive"),
+    "infinite": (lambda: PPOConfig(policy_lr=math.inf), "--policy-lr inf: must be positive"),
+    "clip": (lambda: PPOConfig(clip=-0.15), "--clip -0.15: must be positive"),
+    "kl": (lambda: PPOConfig(target_kl=0.0), "--target-kl 0.0: must be positive"),
+    "rejection": (
+        lambda: PPOConfig(reject_mean_sq_reward=0.0),
+        "--reject-mean-sq-reward 0.0: must be positive",
+    ),
+    "entropy": (
+        lambda: PPOConfig(entropy_coef=-0.01),
+        "--entropy-coef -0.01: must be 0 or positive",
+    ),
+    "norm": (lambda: PPOConfig(max_grad_norm=-1.0), "--max-grad-norm -1.0: must be 0 or positive"),
     "gamma": (lambda: PPOConfig(gamma=1.01), "--gamma 1.01: must be above 0 and at most 1"),
     "gamma 0": (lambda: PPOConfig(gamma=0.0), "--gamma 0.0: must be above 0 and at most 1"),
     "lambda": (lambda: PPOConfig(gae_lambda=-0.1), "--gae-lambda -0.1: must be 0 to 1"),
