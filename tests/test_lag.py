@@ -89,7 +89,7 @@ def test_sections_are_cached_plain_numbers():
     assert lag.sections(parse_delay("E2")) == ()
 
 
-@settings(max_examples=25, deadline=None, derandomize=True, phases=NO_SHRINKING)
+@settings(max_examples=16, deadline=None, derandomize=True, phases=NO_SHRINKING)
 @given(order=st.integers(1, 8), cutoff_hz=st.floats(0.5, 24.0), seed=st.integers(0, 2**31))
 def test_filter_equals_scipy_in_float64(order, cutoff_hz, seed):
     delay = Delay("literal", order=order, cutoff_hz=cutoff_hz)
@@ -102,7 +102,7 @@ def test_filter_equals_scipy_in_float64(order, cutoff_hz, seed):
     np.testing.assert_allclose(got, filtered(delay, first, x), rtol=0, atol=atol)
 
 
-@settings(max_examples=15, deadline=None, derandomize=True, phases=NO_SHRINKING)
+@settings(max_examples=8, deadline=None, derandomize=True, phases=NO_SHRINKING)
 @given(order=st.integers(1, 8), cutoff_hz=st.floats(0.5, 24.0), seed=st.integers(0, 2**31))
 def test_filter_equals_scipy_in_float32(order, cutoff_hz, seed):
     delay = Delay("literal", order=order, cutoff_hz=cutoff_hz)
@@ -142,7 +142,7 @@ def test_constant_stays_in_float32(name):
     np.testing.assert_allclose(got, np.broadcast_to(first, got.shape), rtol=0, atol=3e-6)
 
 
-@settings(max_examples=10, deadline=None, derandomize=True, phases=NO_SHRINKING)
+@settings(max_examples=6, deadline=None, derandomize=True, phases=NO_SHRINKING)
 @given(order=st.integers(1, 8), cutoff_hz=st.floats(2.0, 24.0))
 def test_dc_gain_is_one(order, cutoff_hz):
     """A step ends on its height: from another start, after many time constants."""
