@@ -1,6 +1,7 @@
 """Order of the tests, JAX set-up before its import, fixtures shared by several files."""
 
 import os
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,11 @@ import pytest
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("MUJOCO_GL", "disable")
 
+# A shell starts background jobs (nohup, some CI runners) with SIGINT ignored, and children inherit
+# it; the tests of Ctrl-C would then wait for an interrupt that never comes.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
 try:
     from mcx_jax.startup import configure
 except ImportError as error:  # a broken start-up module must fail its own tests, not all of them
@@ -18,34 +24,28 @@ except ImportError as error:  # a broken start-up module must fail its own tests
 else:
     START_UP = configure()
 
-ORDER = (
-    # Seconds: no compilation, or little.
+CHEAP = (
     "test_assets",
+    "test_packaging",
     "test_config",
     "test_cli",
     "test_spatial",
     "test_results",
     "test_policy",
-    "test_lag",
     "test_observe",
     "test_sea_recording",
     "test_sea_spectrum",
     "test_sea_sampler",
     "test_sea_tables",
     "test_ppo_math",
-    "test_ppo_networks",
     "test_checkpoint",
-    # Tens of seconds: physics and learning.
-    "test_ik",
-    "test_physics",
-    "test_v2v",
-    "test_ppo_trainer",
+    "test_lag",
+    "test_ppo_networks",
 )
-"""File stems, cheapest first, so that a mistake shows early. Files not named here come next,
-by name; LAST comes last."""
+"""File stems that take seconds, cheapest first, so that a mistake shows early."""
 
-LAST = ("test_train_command", "test_packaging")
-"""Whole commands in processes of their own."""
+EXPENSIVE = ("test_ik", "test_train_command", "test_physics", "test_ppo_trainer", "test_v2v")
+"""File stems that take a minute or more on two cores. Files in neither list come between."""
 
 
 def pytest_report_header() -> list[str]:
@@ -54,15 +54,15 @@ def pytest_report_header() -> list[str]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Sort files by ORDER; within a file, slow tests last and otherwise as written."""
+    """Cheap files, unlisted files by name, expensive files; within a file slow tests last."""
 
-    def rank(item: pytest.Item) -> tuple[int, str, bool]:
-        stem = item.path.stem
-        if stem in ORDER:
-            return ORDER.index(stem), "", item.get_closest_marker("slow") is not None
-        if stem in LAST:
-            return len(ORDER) + 1 + LAST.index(stem), "", False
-        return len(ORDER), stem, False
+    def rank(item: pytest.Item) -> tuple[int, int, str, bool]:
+        stem, slow = item.path.stem, item.get_closest_marker("slow") is not None
+        if stem in CHEAP:
+            return 0, CHEAP.index(stem), stem, slow
+        if stem in EXPENSIVE:
+            return 2, EXPENSIVE.index(stem), stem, slow
+        return 1, 0, stem, slow
 
     items.sort(key=rank)
 
