@@ -61,7 +61,7 @@ def compiled_pose(arm_model):
 
 
 def solve(arm_model, q, r, p, iterations=ik.COLD_ITERATIONS):
-    """Solutions of n goals; padded with the first to ROWS, so that all tests share a compilation."""
+    """Solutions of n goals; padded to ROWS, so that all tests share a compilation."""
     n = len(p)
     q = np.broadcast_to(q, (n, arm_model.nq))
     rows = [jnp.asarray(x)[np.arange(ROWS) * (np.arange(ROWS) < n)] for x in (q, r, p)]
