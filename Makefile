@@ -31,7 +31,7 @@ test: check  ## lint, format, types, then all tests, cheap ones first
 check: $(VENV)/.dev  ## lint, format and types only
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
-	$(PY) -m pyright
+	$(PY) -m pyright --pythonpath $(PY)
 
 format: $(VENV)/.dev  ## mend what ruff can mend
 	$(PY) -m ruff check --fix .
