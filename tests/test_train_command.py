@@ -6,6 +6,8 @@ Training runs on a probe environment here; the whole path with the real one is t
 import json
 import os
 import signal
+import subprocess
+import sys
 from dataclasses import replace
 
 import jax
@@ -19,7 +21,7 @@ from mcx_jax.errors import UserError
 from mcx_jax.policy import load_policy
 from mcx_jax.progress import Progress, short_time
 from mcx_jax.run_dir import default_path, open_existing, open_new
-from mcx_jax.train import StopRequest, main, read_command, start, train
+from mcx_jax.train import StopRequest, compile_quickly, main, read_command, start, train
 
 CONFIG = replace(
     preset_config("fast"),
@@ -256,6 +258,15 @@ def test_second_signal_acts_as_usual():
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+def test_smoke_compiles_quickly_unless_told_otherwise(monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--one")
+    assert "+= --xla_backend_optimization_level=0" in compile_quickly()
+    assert os.environ["XLA_FLAGS"] == "--one --xla_backend_optimization_level=0"
+    monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=2")
+    compile_quickly()
+    assert os.environ["XLA_FLAGS"] == "--xla_backend_optimization_level=2"
+
+
 def test_short_time():
     assert [short_time(s) for s in (12.4, 200, 3900)] == ["12 s", "3 min 20 s", "1 h 05 min"]
 
@@ -265,3 +276,21 @@ def test_restored_checkpoint_of_another_size_is_refused(finished, tmp_path):
     like = start(open_new(tmp_path / "other", config), make_probe())
     with pytest.raises(UserError, match="cannot be restored"):
         checkpoint.restore_latest(finished, like)
+
+
+@pytest.mark.slow
+def test_smoke_runs_the_whole_path(tmp_path):
+    """Train, checkpoint, evaluate, with the real environment."""
+    command = [sys.executable, "-m", "mcx_jax.train", "--smoke", "--delay", "E1"]
+    done = subprocess.run(
+        [*command, "--run-dir", str(tmp_path / "run")], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    names = {p.name for p in (tmp_path / "run").iterdir()}
+    assert names == {"checkpoints", "config.json", "metrics.jsonl", "policy.npz"}
+    assert "E1: explicit delay of 1 control steps = 20 ms" in done.stdout
+    table = [line.split("│")[1:3] for line in done.stdout.splitlines() if line.startswith("│")]
+    rows = [tuple(word.strip() for word in cells) for cells in table]
+    seas = ("Wa", "Wb", "Wc", "Wd")
+    assert rows == [(who, sea) for who in ("ik", "policy") for sea in seas]
+    assert done.stdout.splitlines()[-1] == f"done: {tmp_path / 'run' / 'policy.npz'}"
