@@ -7,7 +7,7 @@ from mcx_jax.envs.model import load_mujoco
 
 
 def free_base_model(arm: str | mujoco.MjModel) -> mujoco.MjModel:
-    """The arm on a free body (6 dof): its base can be given any position, velocity, acceleration."""
+    """The arm on a free body (6 dof): its base can be given any pose, velocity, acceleration."""
     spec = mujoco.MjSpec()
     body = spec.worldbody.add_body(name="deck")
     body.add_freejoint(name="deck_joint")

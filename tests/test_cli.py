@@ -54,8 +54,8 @@ def test_flags_are_flat():
         (
             "--delay late",
             (
-                "unknown delay 'late': use one of E0, E1, E2, B4_21, B4_4, E<k> for k control steps, "
-                "or butter:<order>:<cutoff>Hz, e.g. butter:4:7.5Hz"
+                "unknown delay 'late': use one of E0, E1, E2, B4_21, B4_4, E<k> for k control "
+                "steps, or butter:<order>:<cutoff>Hz, e.g. butter:4:7.5Hz"
             ),
         ),
     ],

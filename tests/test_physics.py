@@ -1,4 +1,4 @@
-"""Both physics engines against C MuJoCo: one step at random states, moving base, saturated servo."""
+"""Both physics engines against C MuJoCo: random states, moving base, saturated servo."""
 
 import jax
 import jax.numpy as jnp
@@ -129,7 +129,8 @@ UNSUPPORTED = {
 def test_models_that_the_chain_engine_cannot_take_are_refused(fault):
     xml = (
         "<mujoco><compiler angle='radian'/><worldbody><body>"
-        f"{UNSUPPORTED[fault]}<geom size='.1' contype='0' conaffinity='0'/></body></worldbody></mujoco>"
+        f"{UNSUPPORTED[fault]}<geom size='.1' contype='0' conaffinity='0'/>"
+        "</body></worldbody></mujoco>"
     )
     with pytest.raises(UserError, match=f"chain engine cannot take this arm model: it has {fault}"):
         chain_model(mujoco.MjModel.from_xml_string(xml))

@@ -308,7 +308,8 @@ def substeps(
 
     def body(i, state):
         base = stage(wall, base_at, i)
-        angles, rates = substep(model, integrator, *state, commands, base, wall)
+        angles, rates = state
+        angles, rates = substep(model, integrator, angles, rates, commands, base, wall)
         return tuple(angles), tuple(rates)
 
     n = model.nq

@@ -61,7 +61,7 @@ class IKResult:
     q: jax.Array
     """(nq,) joint angles, rad."""
     error: jax.Array
-    """() |position error| m + |rotation error| rad before the last step (a bound on what is left)."""
+    """() |position error| m + |rotation error| rad before the last step: a bound on the rest."""
     ok: jax.Array
     """() bool: error below TOLERANCE and finite."""
 

@@ -32,8 +32,8 @@ def sections(delay: Delay) -> tuple[tuple[float, ...], ...]:
         return ()
     from scipy.signal import butter
 
-    sos = butter(delay.order, delay.cutoff_hz / NYQUIST_HZ, output="sos")
-    return tuple((*map(float, s[:3]), float(s[4]), float(s[5])) for s in sos)
+    sos = np.asarray(butter(delay.order, delay.cutoff_hz / NYQUIST_HZ, output="sos"))
+    return tuple(tuple(row) for row in sos[:, [0, 1, 2, 4, 5]].tolist())
 
 
 def init(delay: Delay, first: jax.Array) -> LagState:

@@ -87,7 +87,8 @@ def load_mujoco(arm: str) -> mujoco.MjModel:
     path = asset_path(ARMS[arm]) if arm in ARMS else Path(arm)
     if not path.is_file():
         raise UserError(
-            f"--arm {arm}: not one of {', '.join(ARMS)} and no such file; give a name or an MJCF file"
+            f"--arm {arm}: not one of {', '.join(ARMS)} and no such file; "
+            "give a name or an MJCF file"
         )
     try:
         return mujoco.MjModel.from_xml_path(str(path))

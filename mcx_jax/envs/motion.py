@@ -51,8 +51,8 @@ def draw_track(motion: Motion, uniform: jax.Array, sea: jax.Array | int | None =
     """Independent random windows of one table for the two vessels.
 
     Args:
-        uniform: (4,) numbers in [0, 1): sea, seed, start of A, start of B. One draw of seven numbers
-            per reset: every further use of the generator costs 1,500 lines of XLA program.
+        uniform: (4,) numbers in [0, 1): sea, seed, start of A, start of B. One draw serves a
+            whole reset: every further use of the generator costs 1,500 lines of XLA program.
         sea: index into motion.seas; None draws one.
     """
     if sea is None:
@@ -86,8 +86,8 @@ def load_motion(
     last_start = (knots_a.shape[1] - 1) * KNOT_STEPS // SUBSTEPS - needed_steps - 1
     if last_start < 0:
         raise UserError(
-            f"--episode-steps {episode_steps}: an episode of {episode_steps * CONTROL_DT_S:g} s and "
-            f"2 s of look-ahead do not fit into {knots_a.shape[1] * 0.1:g} s of motion"
+            f"--episode-steps {episode_steps}: an episode of {episode_steps * CONTROL_DT_S:g} s "
+            f"and 2 s of look-ahead do not fit into {knots_a.shape[1] * 0.1:g} s of motion"
         )
     device_a = jnp.asarray(knots_a, jnp.float32)
     return Motion(

@@ -4,6 +4,7 @@ Pure, jittable, vmappable, differentiable. `vmap` it with the batch axis last
 (`in_axes=-1, out_axes=-1`): the physics then works on contiguous rows of environments.
 """
 
+from dataclasses import replace
 from typing import Literal
 
 import jax
@@ -90,7 +91,7 @@ class V2VEnv:
     mjx_model: object
     """mjx.Model for --physics mjx, else None."""
     wall: jax.Array | None
-    """() bool, true: keeps XLA on CPU from recomputing stages (see mcx_jax.stage); None on a GPU."""
+    """() bool, true: keeps XLA on CPU from recomputing stages (mcx_jax.stage); None on a GPU."""
     model: ChainModel = struct.field(pytree_node=False)
     delay: Delay = struct.field(pytree_node=False)
     integrator: str = struct.field(pytree_node=False)
@@ -168,7 +169,8 @@ class V2VEnv:
             errors = stage(self.wall, observe.tracking_error, goal, tool)
             obs = observe.observe(goal, tool, errors)
         valid = state.metrics.valid & _valid(found, arm, errors[0])
-        return state.replace(
+        return replace(
+            state,
             arm=arm,
             lag=lag_state,
             reference=reference,
