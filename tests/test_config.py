@@ -173,7 +173,7 @@ REFUSED = {
     "seeds": (lambda: fast(seeds=0), "--seeds 0: must be a positive integer"),
     "seed": (lambda: fast(seed=-1), "--seed -1: must be 0 or a positive integer"),
     "sequences": (
-        lambda: fast(num_envs=12),
+        lambda: fast(num_envs=12, ppo=PPOConfig(minibatches=8)),
         (
             "--num-envs 12 gives 12 sequences a window, which --minibatches 8 does not divide; "
             "use a multiple of 8"
