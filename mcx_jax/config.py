@@ -145,7 +145,7 @@ class PPOConfig:
     """Length of back-propagation through time; divides window_steps."""
     epochs: int = 2
     """Passes over the collected window in one iteration (policy and value at most that many)."""
-    minibatches: int = 8
+    minibatches: int = 16
     """Minibatches of whole sequences per pass."""
     gamma: float = 0.9
     """Discount per control step."""
@@ -157,9 +157,9 @@ class PPOConfig:
     """Weight of the policy's entropy."""
     target_kl: float = 0.05
     """Policy updates of an iteration stop when the KL estimate exceeds 1.5 times this."""
-    policy_lr: float = 1e-3
+    policy_lr: float = 2e-3
     """Adam step size of the policy."""
-    value_lr: float = 1e-3
+    value_lr: float = 2e-3
     """Adam step size of the value network."""
     lr_decay: Literal["constant", "cosine"] = "cosine"
     """Schedule of both step sizes over --total-steps (cosine ends at 5 %)."""
