@@ -19,6 +19,9 @@ CONTROL_DT_S = PHYSICS_DT_S * SUBSTEPS
 """Control step: 50 Hz (paper; authors' code)."""
 NYQUIST_HZ = 0.5 / CONTROL_DT_S
 
+MAX_DELAY_S = 1.0
+"""Longest delay accepted: evaluation looks that far ahead, and slower filters drift in float32."""
+
 NAMED_DELAYS = {
     "E0": "explicit:0",
     "E1": "explicit:1",
@@ -93,7 +96,13 @@ def parse_delay(text: str) -> Delay:
                 f"--delay {text}: the cutoff must be at least 0.1 Hz and below the Nyquist "
                 f"frequency {NYQUIST_HZ:g} Hz (control runs at 50 Hz)"
             )
-        return Delay(name=text, order=order, cutoff_hz=cutoff_hz)
+        delay = Delay(name=text, order=order, cutoff_hz=cutoff_hz)
+        if delay.group_delay_s > MAX_DELAY_S:
+            raise UserError(
+                f"--delay {text}: delays by {delay.group_delay_s:.1f} s; at most {MAX_DELAY_S:g} "
+                "s: raise the cutoff or lower the order"
+            )
+        return delay
     raise UserError(
         f"unknown delay '{text}': use one of {', '.join(NAMED_DELAYS)}, E<k> for k control steps, "
         "or butter:<order>:<cutoff>Hz, e.g. butter:4:7.5Hz"
@@ -245,6 +254,14 @@ class MotionConfig:
 
     def __post_init__(self) -> None:
         _require(self.motion_scale > 0, f"--motion-scale {self.motion_scale}: must be positive")
+        _require(
+            not (self.motion and self.sea != "all"),
+            f"--sea {self.sea} has no meaning with --motion: a recording is one sea; leave one out",
+        )
+        _require(
+            not (self.motion and self.coupled),
+            "--coupled has no meaning with --motion: one recording holds one vessel; leave one out",
+        )
 
 
 @dataclass(frozen=True)
@@ -263,7 +280,7 @@ class TrainConfig:
     """Random seed."""
     seeds: int = 1
     """Train this many seeds (seed, seed+1, ...) in one vmapped call."""
-    env: EnvConfig = field(default_factory=EnvConfig)
+    env: EnvConfig = field(default_factory=lambda: EnvConfig(episode_steps=1024))
     motion: MotionConfig = field(default_factory=MotionConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
 
@@ -302,7 +319,7 @@ class TrainConfig:
 
 def preset_config(preset: str) -> TrainConfig:
     """The defaults of a preset: `fast` (32-step windows, 1024-step episodes) or `paper`."""
-    fast = TrainConfig(env=EnvConfig(episode_steps=1024))
+    fast = TrainConfig()
     if preset == "fast":
         return fast
     if preset == "paper":

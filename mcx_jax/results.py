@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from mcx_jax.errors import UserError
 from mcx_jax.paper import table3
 
 WARM_UP_STEPS = 50
@@ -41,18 +42,27 @@ def row(
 ) -> dict[str, Any]:
     """One result row of the evaluation's JSON (without the improvement).
 
+    Invalid episodes count like the others; only those with a number that is not finite can not
+    (they are among `invalid_episodes`).
+
     Args:
         pos_m, ang_rad: (steps, episodes) errors of whole episodes.
         valid: (episodes,) bool.
+
+    Raises:
+        UserError: no episode has finite errors.
     """
+    finite = np.isfinite(pos_m).all(axis=0) & np.isfinite(ang_rad).all(axis=0)
+    if not finite.any():
+        raise UserError(f"{who}, {delay}, {sea}: every episode diverged: nothing to report")
     return {
         "who": who,
         "delay": delay,
         "sea": sea,
         "episodes": int(valid.size),
         "invalid_episodes": int((~valid).sum()),
-        "pos_mm": error_statistics(1e3 * pos_m[WARM_UP_STEPS:]),
-        "ang_mrad": error_statistics(1e3 * ang_rad[WARM_UP_STEPS:]),
+        "pos_mm": error_statistics(1e3 * pos_m[WARM_UP_STEPS:, finite]),
+        "ang_mrad": error_statistics(1e3 * ang_rad[WARM_UP_STEPS:, finite]),
     }
 
 

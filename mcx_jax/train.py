@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from mcx_jax.ppo.trainer import IterationMetrics, TrainState
 
 CHECKPOINT_INTERVAL_S = 60.0
-FINAL_EPISODES = 50
-SMOKE_EPISODES = 2
+FINAL_EPISODES, FINAL_STEPS = 50, 1000
+SMOKE_EPISODES, SMOKE_STEPS = 2, 96
 SMOKE_ITERATIONS = 3
 
 
@@ -264,19 +264,25 @@ def train(run: RunDir, make_env: Callable[..., Any]) -> "Policy":
     return policy
 
 
-def final_table(config: TrainConfig, policy: "Policy", episodes: int) -> None:
-    """Evaluate the policy beside the IK baseline on test motion and print the table."""
+def final_table(config: TrainConfig, policy: "Policy", episodes: int, steps: int) -> None:
+    """Evaluate the policy beside the IK baseline on test motion and print the table.
+
+    Args:
+        episodes: per sea.
+        steps: control steps of an episode, whatever the length in training.
+    """
     from mcx_jax.controllers import CLASSICAL
     from mcx_jax.evaluate import evaluate, print_table
     from mcx_jax.policy import PolicyController
 
     named = config.motion.sea in ("all", "Wa", "Wb", "Wc", "Wd")
     motion = replace(config.motion, sea="all") if named else config.motion
-    baseline = evaluate("ik", CLASSICAL["ik"], config.env, motion, episodes=episodes)
+    env = replace(config.env, episode_steps=steps)
+    baseline = evaluate("ik", CLASSICAL["ik"], env, motion, episodes=episodes)
     rows = evaluate(
         "policy",
         PolicyController(policy),
-        config.env,
+        env,
         motion,
         episodes=episodes,
         baseline=baseline,
@@ -316,7 +322,8 @@ def main(argv: list[str] | None = None) -> None:
     except KeyboardInterrupt:
         print("\nstopped before the end of an iteration; go on with --resume if a run had begun")
         raise SystemExit(130) from None
-    final_table(run.config, policy, SMOKE_EPISODES if command.smoke else FINAL_EPISODES)
+    length = (SMOKE_EPISODES, SMOKE_STEPS) if command.smoke else (FINAL_EPISODES, FINAL_STEPS)
+    final_table(run.config, policy, *length)
     print(f"done: {run.path / POLICY}")
 
 

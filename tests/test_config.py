@@ -50,7 +50,7 @@ NYQUIST = (
         ("B4_4", Delay("B4_4", order=4, cutoff_hz=10.4)),
         ("butter:4:7.5Hz", Delay("butter:4:7.5Hz", order=4, cutoff_hz=7.5)),
         ("butter:12:24.9", Delay("butter:12:24.9", order=12, cutoff_hz=24.9)),
-        ("butter:1:0.1Hz", Delay("butter:1:0.1Hz", order=1, cutoff_hz=0.1)),
+        ("butter:1:0.2Hz", Delay("butter:1:0.2Hz", order=1, cutoff_hz=0.2)),
     ],
 )
 def test_delay_names_and_literals(text, want):
@@ -166,6 +166,21 @@ REFUSED = {
     "sequence does not divide window": (
         lambda: PPOConfig(window_steps=32, sequence_steps=12),
         "--sequence-steps 12 must divide --window-steps 32",
+    ),
+    "sea and recording": (
+        lambda: MotionConfig(motion="log.csv", sea="Wa"),
+        "--sea Wa has no meaning with --motion: a recording is one sea; leave one out",
+    ),
+    "coupled recording": (
+        lambda: MotionConfig(motion="log.csv", coupled=True),
+        "--coupled has no meaning with --motion: one recording holds one vessel; leave one out",
+    ),
+    "slow filter": (
+        lambda: EnvConfig(delay="butter:12:0.1Hz"),
+        (
+            "--delay butter:12:0.1Hz: delays by 12.2 s; at most 1 s: raise the cutoff or lower "
+            "the order"
+        ),
     ),
     "scale": (lambda: MotionConfig(motion_scale=0.0), "--motion-scale 0.0: must be positive"),
     "environments": (lambda: fast(num_envs=0), "--num-envs 0: must be a positive integer"),

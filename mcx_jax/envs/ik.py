@@ -165,7 +165,7 @@ def solve(
     start = tuple(lax.stop_gradient(q_start[i]) for i in range(model.nq))
     q, error = _iterate(model, iterations, wall, start, target)
     error = lax.stop_gradient(error)
-    finite = jnp.isfinite(error)
+    finite = jnp.isfinite(error + total(q))
     q = tuple(jnp.where(finite, x, s) for x, s in zip(q, start, strict=True))
     return IKResult(q=jnp.stack(q), error=error, ok=finite & (error < TOLERANCE))
 
