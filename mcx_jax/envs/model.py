@@ -181,7 +181,7 @@ def refuse_unsupported(mj: mujoco.MjModel) -> None:
         if present:
             raise UserError(
                 f"the chain engine cannot take this arm model: it has {fault}; "
-                "change the model or use --physics mjx"
+                "take that out of the MJCF file"
             )
 
 
