@@ -43,7 +43,7 @@ class EvaluateConfig:
             raise UserError(f"--seed {self.seed}: must be 0 or a positive integer")
 
 
-def run_episodes(env, controller, keys, seas):
+def run_episodes(env, controller, keys, seas, gain):
     """Whole episodes, batch axis last inside.
 
     Args:
@@ -51,6 +51,8 @@ def run_episodes(env, controller, keys, seas):
         controller: see mcx_jax.controllers.
         keys: (N,) PRNG keys.
         seas: (N,) int32 sea index per episode.
+        gain: (N,) factor of the controller's actions: 0 makes an episode one of the IK baseline, so
+            that baseline and controller share one program (compiling takes ten times the run).
 
     Returns:
         dp (steps, N) m, da (steps, N) rad, valid (N,) bool.
@@ -66,7 +68,7 @@ def run_episodes(env, controller, keys, seas):
     def body(carry, _):
         state, memory = carry
         memory, action = act(state, memory)
-        state = step(state, action)
+        state = step(state, gain * action)
         return (state, memory), (state.metrics.pos_error_m, state.metrics.ang_error_rad)
 
     (state, _), (dp, da) = jax.lax.scan(body, (state, memory), None, env.episode_steps)
@@ -81,23 +83,70 @@ def _compiled():
     return jax.jit(run_episodes)
 
 
-def episode_errors(env, controller, episodes: int, seed: int):
-    """Errors of `episodes` test episodes in each of the env's seas, as NumPy arrays.
+def episode_errors(env, controller, gains: tuple[float, ...], episodes: int, seed: int):
+    """Errors of `episodes` test episodes for each gain and each of the env's seas (NumPy).
+
+    The episodes of every gain and sea have the same windows of motion and the same goals, so that
+    a difference is the controller's or the sea's alone.
 
     Returns:
-        (dp m, da rad, valid) of shapes (steps, seas, episodes), the same, (seas, episodes).
+        (dp m, da rad, valid) of shapes (steps, gains, seas, episodes), the same, and without steps.
     """
     import jax
     import jax.numpy as jnp
 
-    count = len(env.motion.seas)
-    keys = jax.random.split(jax.random.key(seed), episodes)
-    # The same windows and goals in every sea, so that a sea's difference is the sea's alone.
-    keys = jnp.tile(keys, count)
-    seas = jnp.repeat(jnp.arange(count, dtype=jnp.int32), episodes)
-    dp, da, valid = jax.device_get(_compiled()(env, controller, keys, seas))
-    shape = (-1, count, episodes)
-    return dp.reshape(shape), da.reshape(shape), valid.reshape(count, episodes)
+    shape = (len(gains), len(env.motion.seas), episodes)
+    keys = jnp.tile(jax.random.split(jax.random.key(seed), episodes), shape[0] * shape[1])
+    seas = jnp.broadcast_to(jnp.arange(shape[1], dtype=jnp.int32)[:, None], shape).ravel()
+    gain = jnp.broadcast_to(jnp.asarray(gains)[:, None, None], shape).ravel()
+    dp, da, valid = jax.device_get(_compiled()(env, controller, keys, seas, gain))
+    return dp.reshape(-1, *shape), da.reshape(-1, *shape), valid.reshape(shape)
+
+
+def evaluate_beside_ik(
+    who: str,
+    controller: Any,
+    env_config: EnvConfig,
+    motion_config: MotionConfig,
+    *,
+    episodes: int = 50,
+    seed: int = 0,
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Evaluate the IK baseline and a controller on the test motion of every sea asked for.
+
+    Args:
+        who: the controller's name in the result; `ik` runs the baseline alone.
+        controller: see mcx_jax.controllers.
+        episodes: per sea.
+        seed: of the windows of motion and the goals; the same for every controller.
+
+    Returns:
+        (rows of ik, rows of who), one a sea, as described in the README (section Evaluate).
+
+    Raises:
+        UserError: episodes that end within the warm-up.
+    """
+    from mcx_jax.envs.v2v import make_env
+    from mcx_jax.results import WARM_UP_STEPS, add_improvement, row
+
+    if env_config.episode_steps <= WARM_UP_STEPS:
+        raise UserError(
+            f"--episode-steps {env_config.episode_steps}: the first {WARM_UP_STEPS} steps are not "
+            f"counted; evaluate at least {WARM_UP_STEPS + 1}"
+        )
+    env = make_env(env_config, motion_config, split="test")
+    names = ("ik",) if who == "ik" else ("ik", who)
+    dp, da, valid = episode_errors(env, controller, (0.0, 1.0)[: len(names)], episodes, seed)
+    rows = [
+        [
+            row(name, env_config.delay, sea, dp[:, k, i], da[:, k, i], valid[k, i])
+            for i, sea in enumerate(env.motion.seas)
+        ]
+        for k, name in enumerate(names)
+    ]
+    for part in rows:
+        add_improvement(part, rows[0])
+    return rows[0], rows[-1]
 
 
 def evaluate(
@@ -108,44 +157,11 @@ def evaluate(
     *,
     episodes: int = 50,
     seed: int = 0,
-    baseline: list[dict[str, Any]] | None = None,
 ) -> list[dict[str, Any]]:
-    """Evaluate one controller on the test motion of every sea asked for.
-
-    Args:
-        who: its name in the result.
-        controller: see mcx_jax.controllers.
-        baseline: rows of `ik` for the same settings; run here if None.
-
-    Returns:
-        One row a sea, as described in the README (section Evaluate).
-
-    Raises:
-        UserError: episodes that end within the warm-up.
-    """
-    from mcx_jax.controllers import IK
-    from mcx_jax.envs.v2v import make_env
-    from mcx_jax.results import WARM_UP_STEPS, add_improvement, row
-
-    if env_config.episode_steps <= WARM_UP_STEPS:
-        raise UserError(
-            f"--episode-steps {env_config.episode_steps}: the first {WARM_UP_STEPS} steps are not "
-            f"counted; evaluate at least {WARM_UP_STEPS + 1}"
-        )
-    env = make_env(env_config, motion_config, split="test")
-
-    def rows_of(name, ctrl):
-        dp, da, valid = episode_errors(env, ctrl, episodes, seed)
-        return [
-            row(name, env_config.delay, sea, dp[:, i], da[:, i], valid[i])
-            for i, sea in enumerate(env.motion.seas)
-        ]
-
-    rows = rows_of(who, controller)
-    if baseline is None:
-        baseline = rows if who == "ik" else rows_of("ik", IK())
-    add_improvement(rows, baseline)
-    return rows
+    """The controller's rows of `evaluate_beside_ik`."""
+    return evaluate_beside_ik(
+        who, controller, env_config, motion_config, episodes=episodes, seed=seed
+    )[1]
 
 
 def print_table(rows: list[dict[str, Any]], file=None) -> None:
@@ -207,10 +223,10 @@ def main(argv: list[str] | None = None) -> None:
         print(line, file=report)
     print(config.env.parsed_delay.describe(), file=report)
     who, controller = load_controller(config.who)
-    rows = evaluate(
+    baseline, rows = evaluate_beside_ik(
         who, controller, config.env, config.motion, episodes=config.episodes, seed=config.seed
     )
-    print_table(rows, file=report)
+    print_table(rows if who == "ik" else baseline + rows, file=report)
     if quiet:
         print(json.dumps(rows, indent=1))
     elif config.json:

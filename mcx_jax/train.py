@@ -271,22 +271,14 @@ def final_table(config: TrainConfig, policy: "Policy", episodes: int, steps: int
         episodes: per sea.
         steps: control steps of an episode, whatever the length in training.
     """
-    from mcx_jax.controllers import CLASSICAL
-    from mcx_jax.evaluate import evaluate, print_table
+    from mcx_jax.evaluate import evaluate_beside_ik, print_table
     from mcx_jax.policy import PolicyController
 
     named = config.motion.sea in ("all", "Wa", "Wb", "Wc", "Wd")
     motion = replace(config.motion, sea="all") if named else config.motion
     env = replace(config.env, episode_steps=steps)
-    baseline = evaluate("ik", CLASSICAL["ik"], env, motion, episodes=episodes)
-    rows = evaluate(
-        "policy",
-        PolicyController(policy),
-        env,
-        motion,
-        episodes=episodes,
-        baseline=baseline,
-    )
+    controller = PolicyController(policy)
+    baseline, rows = evaluate_beside_ik("policy", controller, env, motion, episodes=episodes)
     print_table(baseline + rows)
 
 

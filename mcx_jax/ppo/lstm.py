@@ -5,7 +5,8 @@ The LSTM is the textbook one (Hochreiter & Schmidhuber 1997, forget gate of Gers
 its four gates in one matrix, order input, forget, cell, output. `unroll` multiplies the whole
 sequence by the input matrix at once; inside the scan only the recurrent product is left. Its
 reverse mode is written out, so that the gradient of the recurrent matrix is one product over all
-steps instead of one (H, 4H) accumulation per step: 1.5 times as fast on CPU.
+steps instead of one (H, 4H) accumulation per step: on two CPU cores 1.2
+(32 steps of 64) to 1.6 times (1000 steps of 8) as fast.
 """
 
 import flax.linen as nn
