@@ -12,12 +12,12 @@ from mcx_jax.sea.sampler import (
     PHYSICS_DT_S,
     body_rates,
     hermite,
-    rotation_rpy,
     segment_rows,
 )
 from mcx_jax.sea.spectrum import SEAS
 from mcx_jax.sea.statistics import body_rate, rotation
 from mcx_jax.sea.tables import build_tables
+from mcx_jax.spatial import rotation_rpy
 
 
 def _rows(values0, rates0, values1, rates1, dtype=None):
@@ -122,6 +122,10 @@ def test_last_start_window_stays_inside_its_table():
     assert last // KNOT_STEPS + 1 == tables.knots.shape[1] - 1
 
 
+def matrix(rpy):
+    return jnp.array(rotation_rpy(*rpy))
+
+
 def test_rotation_is_yaw_after_pitch_after_roll():
     def about(axis, angle):
         c, s = np.cos(angle), np.sin(angle)
@@ -133,7 +137,7 @@ def test_rotation_is_yaw_after_pitch_after_roll():
 
     rpy = np.array([0.3, -0.5, 1.1])
     want = about(2, rpy[2]) @ about(1, rpy[1]) @ about(0, rpy[0])
-    np.testing.assert_allclose(rotation_rpy(jnp.asarray(rpy)), want, atol=1e-6)  # float32
+    np.testing.assert_allclose(matrix(jnp.asarray(rpy)), want, atol=1e-6)  # float32
     np.testing.assert_allclose(rotation(rpy[None])[0], want, atol=1e-15)
 
 
@@ -148,8 +152,8 @@ def test_body_rates_against_numerical_differentiation():
 
             def spin(t, angles=angles):
                 # R^T dR/dt = skew(w_body), dR/dt by central difference: error h^2, 1e-10 / h
-                r, h = rotation_rpy(angles(t)), 1e-5
-                skew = r.T @ (rotation_rpy(angles(t + h)) - rotation_rpy(angles(t - h))) / (2 * h)
+                r, h = matrix(angles(t)), 1e-5
+                skew = r.T @ (matrix(angles(t + h)) - matrix(angles(t - h))) / (2 * h)
                 return np.array([skew[2, 1] - skew[1, 2], skew[0, 2] - skew[2, 0],
                                  skew[1, 0] - skew[0, 1]]) / 2  # fmt: skip
 
@@ -172,6 +176,6 @@ def test_derivatives_are_finite_at_rest():
     def total(row):
         x, xd, xdd = hermite(row, row, 25)
         w, al = body_rates(x[3:], xd[3:], xdd[3:])
-        return jnp.sum(rotation_rpy(x[3:])) + jnp.sum(w) + jnp.sum(al)
+        return jnp.sum(matrix(x[3:])) + jnp.sum(w) + jnp.sum(al)
 
     assert np.isfinite(jax.grad(total)(jnp.zeros(12))).all()

@@ -12,7 +12,7 @@ from mcx_jax.config import PHYSICS_DT_S
 from mcx_jax.sea.tables import KNOT_DT_S, KNOT_STEPS
 from mcx_jax.spatial import sincos
 
-__all__ = ["KNOT_STEPS", "PHYSICS_DT_S", "body_rates", "hermite", "rotation_rpy", "segment_rows"]
+__all__ = ["KNOT_STEPS", "PHYSICS_DT_S", "body_rates", "hermite", "segment_rows"]
 
 
 def segment_rows(
@@ -59,18 +59,6 @@ def hermite(
         xd.append((slope0 + u * (2.0 * c2 + u * (3.0 * c3))) / KNOT_DT_S)
         xdd.append((2.0 * c2 + u * (6.0 * c3)) / KNOT_DT_S**2)
     return jnp.stack(x), jnp.stack(xd), jnp.stack(xdd)
-
-
-def rotation_rpy(rpy: jax.Array) -> jax.Array:
-    """Rz(yaw) Ry(pitch) Rx(roll): (3,) rad -> (3, 3), body axes to parent axes."""
-    sr, sp, sy = jnp.sin(rpy[0]), jnp.sin(rpy[1]), jnp.sin(rpy[2])
-    cr, cp, cy = jnp.cos(rpy[0]), jnp.cos(rpy[1]), jnp.cos(rpy[2])
-    rows = (
-        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
-        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
-        (-sp, cp * sr, cp * cr),
-    )
-    return jnp.stack([jnp.stack(row) for row in rows])
 
 
 def body_rates(
