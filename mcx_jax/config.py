@@ -6,7 +6,7 @@ its help text. Derived values are properties. All classes are hashable: they are
 
 import math
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 from mcx_jax.errors import UserError
@@ -234,6 +234,25 @@ PAPER_PPO = PPOConfig(
 
 
 @dataclass(frozen=True)
+class FirstOrderConfig:
+    """Back-propagation through the simulator (--algo first-order)."""
+
+    horizon_steps: int = 10
+    """Control steps that a gradient reaches through; the longest delay of the paper is two."""
+    windows: int = 10
+    """Windows of --horizon-steps, each with one gradient step, in one iteration."""
+    learning_rate: float = 5e-4
+    """Adam step size, falling along half a cosine to 5 % (3e-3 diverges)."""
+
+    def __post_init__(self) -> None:
+        for name in ("horizon_steps", "windows", "learning_rate"):
+            value = getattr(self, name)
+            _require(
+                0 < value < float("inf"), f"--{name.replace('_', '-')} {value}: must be positive"
+            )
+
+
+@dataclass(frozen=True)
 class MotionConfig:
     """Where the vessels' motion comes from."""
 
@@ -270,8 +289,8 @@ class TrainConfig:
 
     preset: Literal["fast", "paper"] = "fast"
     """Defaults of all other settings: fast, or the paper's schedule to the letter."""
-    algo: Literal["ppo"] = "ppo"
-    """Learning algorithm."""
+    algo: Literal["ppo", "first-order"] = "ppo"
+    """Learning algorithm: ppo, or first-order (gradient through the simulator)."""
     num_envs: int = 2048
     """Environments stepped in parallel."""
     total_steps: int = 20_000_000
@@ -283,6 +302,7 @@ class TrainConfig:
     env: EnvConfig = field(default_factory=lambda: EnvConfig(episode_steps=1024))
     motion: MotionConfig = field(default_factory=MotionConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
+    first_order: FirstOrderConfig = field(default_factory=FirstOrderConfig)
 
     def __post_init__(self) -> None:
         for name in ("num_envs", "total_steps", "seeds"):
@@ -295,21 +315,33 @@ class TrainConfig:
             f"--num-envs {self.num_envs} gives {sequences} sequences a window, which --minibatches "
             f"{self.ppo.minibatches} does not divide; use a multiple of {self.ppo.minibatches}",
         )
+        name = "--window-steps" if self.algo == "ppo" else "--horizon-steps times --windows"
         _require(
-            self.env.episode_steps % self.ppo.window_steps == 0,
-            f"--episode-steps {self.env.episode_steps} must be a multiple of --window-steps "
-            f"{self.ppo.window_steps}",
+            self.env.episode_steps % self.iteration_steps == 0,
+            f"--episode-steps {self.env.episode_steps} must be a multiple of {name} "
+            f"{self.iteration_steps}",
+        )
+        _require(
+            self.algo == "ppo" or self.env.physics == "chain",
+            f"--algo {self.algo} needs --physics chain: MJX's step has no useful derivative here",
         )
 
     @property
+    def iteration_steps(self) -> int:
+        """Control steps that every environment makes in an iteration."""
+        if self.algo == "first-order":
+            return self.first_order.horizon_steps * self.first_order.windows
+        return self.ppo.window_steps
+
+    @property
     def reset_groups(self) -> int:
-        """Environments are reset in this many groups, one group per window (see ppo.rollout)."""
-        return self.env.episode_steps // self.ppo.window_steps
+        """Environments are reset in this many groups, one an iteration (see ppo.rollout)."""
+        return self.env.episode_steps // self.iteration_steps
 
     @property
     def steps_per_iteration(self) -> int:
         """Control steps collected per iteration and seed."""
-        return self.num_envs * self.ppo.window_steps
+        return self.num_envs * self.iteration_steps
 
     @property
     def iterations(self) -> int:
@@ -317,13 +349,14 @@ class TrainConfig:
         return -(-self.total_steps // self.steps_per_iteration)
 
 
-def preset_config(preset: str) -> TrainConfig:
-    """The defaults of a preset: `fast` (32-step windows, 1024-step episodes) or `paper`."""
-    fast = TrainConfig()
+def preset_config(preset: str, algo: str = "ppo") -> TrainConfig:
+    """The defaults of a preset (`fast` or `paper`) and an algorithm."""
+    if preset not in ("fast", "paper"):
+        raise UserError(f"unknown preset '{preset}': use fast or paper")
+    paper_env = EnvConfig(episode_steps=1000)
+    if algo == "first-order":
+        # 256 environments: the gradient has no exploration noise to average out.
+        return TrainConfig(algo="first-order", num_envs=256, total_steps=5_000_000, env=paper_env)
     if preset == "fast":
-        return fast
-    if preset == "paper":
-        return replace(
-            fast, preset="paper", num_envs=8, env=EnvConfig(episode_steps=1000), ppo=PAPER_PPO
-        )
-    raise UserError(f"unknown preset '{preset}': use fast or paper")
+        return TrainConfig()
+    return TrainConfig(preset="paper", num_envs=8, env=paper_env, ppo=PAPER_PPO)

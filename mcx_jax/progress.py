@@ -69,10 +69,11 @@ class Progress:
         left = (total - iteration) * elapsed / max(done, 1)
         position = " ".join(f"{row['pos_error_mm']:.3f}" for row in rows)
         angle = " ".join(f"{row['ang_error_mrad']:.3f}" for row in rows)
+        noise = f"sigma {rows[0]['sigma']:.3f} | " if "sigma" in rows[0] else ""
         return (
             f"iteration {iteration}/{total} | {rows[0]['steps'] / 1e6:.2f} M steps | "
             f"{rate:,.0f} steps/s | {position} mm {angle} mrad | "
-            f"sigma {rows[0]['sigma']:.3f} | ETA {short_time(left)}"
+            f"{noise}ETA {short_time(left)}"
         )
 
     def _warn(self, rows: list[dict[str, Any]]) -> None:

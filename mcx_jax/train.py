@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import FrameType
+from types import FrameType, ModuleType
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from mcx_jax import checkpoint, cli
@@ -57,9 +57,12 @@ def smoke_config(config: TrainConfig) -> TrainConfig:
         epochs=min(config.ppo.epochs, 4),
         minibatches=2 if fast else 1,
     )
+    first_order = replace(config.first_order, horizon_steps=8, windows=4)
     env = replace(config.env, episode_steps=episode)
     steps = SMOKE_ITERATIONS * 16 * window
-    return replace(config, num_envs=16, total_steps=steps, env=env, ppo=ppo)
+    return replace(
+        config, num_envs=16, total_steps=steps, env=env, ppo=ppo, first_order=first_order
+    )
 
 
 def read_command(argv: list[str]) -> tuple[TrainCommand, RunDir]:
@@ -68,7 +71,8 @@ def read_command(argv: list[str]) -> tuple[TrainCommand, RunDir]:
     `--preset` and `--smoke` change the defaults of the other flags; with `--resume` the stored
     configuration is the default, and a flag that contradicts it is refused.
     """
-    defaults = preset_config(cli.value_of(argv, "--preset") or "fast")
+    algo = cli.value_of(argv, "--algo") or "ppo"
+    defaults = preset_config(cli.value_of(argv, "--preset") or "fast", algo)
     if "--smoke" in argv:
         defaults = smoke_config(defaults)
     parse = functools.partial(cli.parse, TrainCommand, argv, prog="train")
@@ -113,18 +117,24 @@ class StopRequest:
         print("\nstopping at the end of this iteration (again: at once)", flush=True)
 
 
+def algorithm(config: TrainConfig) -> ModuleType:
+    """The trainer module of the configuration's algorithm; both have the same functions."""
+    from mcx_jax.first_order import trainer as first_order
+    from mcx_jax.ppo import trainer as ppo
+
+    return {"ppo": ppo, "first-order": first_order}[config.algo]
+
+
 def start(run: RunDir, env: Any) -> "TrainState":
     """The state to begin with: new, or the last checkpoint's. A seed axis if --seeds > 1."""
     import jax
 
-    from mcx_jax.ppo.trainer import init, init_seeds
-
-    config = run.config
+    config, algo = run.config, algorithm(run.config)
     if config.seeds > 1:
         keys = jax.vmap(jax.random.key)(jax.numpy.arange(config.seed, config.seed + config.seeds))
-        first = jax.jit(init_seeds, static_argnums=0)
+        first = jax.jit(algo.init_seeds, static_argnums=0)
     else:
-        keys, first = jax.random.key(config.seed), jax.jit(init, static_argnums=0)
+        keys, first = jax.random.key(config.seed), jax.jit(algo.init, static_argnums=0)
     if run.start_iteration:
         return checkpoint.restore_latest(run.path, jax.eval_shape(first, config, env, keys))
     return jax.block_until_ready(first(config, env, keys))
@@ -134,9 +144,8 @@ def compile_iteration(config: TrainConfig, env: Any, state: "TrainState") -> Cal
     """The compiled iteration, (env, state) -> (state, metrics); it consumes the old state."""
     import jax
 
-    from mcx_jax.ppo.trainer import train_iteration, train_iteration_seeds
-
-    iteration = train_iteration_seeds if config.seeds > 1 else train_iteration
+    algo = algorithm(config)
+    iteration = algo.train_iteration_seeds if config.seeds > 1 else algo.train_iteration
     jitted = jax.jit(iteration, static_argnums=0, donate_argnums=2)
     return jitted.lower(config, env, state).compile()
 

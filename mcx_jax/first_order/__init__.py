@@ -1,0 +1,1 @@
+"""Learning by the gradient of the error THROUGH the simulator, in short windows."""

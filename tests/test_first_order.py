@@ -1,0 +1,97 @@
+"""Back-propagation through the environment, on probe environments (the real one in test_v2v)."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probe_envs import make_probe
+
+from mcx_jax.config import EnvConfig, FirstOrderConfig, TrainConfig, preset_config
+from mcx_jax.errors import UserError
+from mcx_jax.first_order import trainer
+
+CONFIG = replace(
+    preset_config("fast", "first-order"),
+    num_envs=32,
+    total_steps=32 * 16 * 60,
+    env=EnvConfig(episode_steps=16),
+    first_order=FirstOrderConfig(horizon_steps=8, windows=2, learning_rate=3e-3),
+    ppo=replace(TrainConfig().ppo, hidden=32),
+)
+
+
+@pytest.fixture(scope="module")
+def iterate():
+    return jax.jit(trainer.train_iteration, static_argnums=0)
+
+
+def begin(env, seed=0):
+    return jax.jit(trainer.init, static_argnums=0)(CONFIG, env, jax.random.key(seed))
+
+
+def run(iterate, env, iterations=60):
+    state, errors = begin(env), []
+    for _ in range(iterations):
+        state, metrics = iterate(CONFIG, env, state)
+        errors.append(float(metrics.pos_error_mm) / 1e3)
+    return state, metrics, errors
+
+
+def test_learns_to_repeat_what_it_sees(iterate):
+    _, _, errors = run(iterate, make_probe())
+    # Targets are uniform in -1..1: the squared error of a zero action is 1/3.
+    assert errors[0] > 0.2 and errors[-1] < 0.01, (errors[0], errors[-1])
+
+
+def test_learns_to_remember_what_it_saw_first(iterate):
+    """The second window of an episode has only the memory that the first one left."""
+    _, _, errors = run(iterate, make_probe(hold=True), 120)
+    assert errors[-1] < 0.1, errors[-1]
+
+
+def test_gradient_equals_a_central_difference():
+    env = make_probe()
+    state = begin(env)
+
+    def loss(params):
+        return trainer.window_loss(params, CONFIG, env, state.obs_stats, state.actors)[0]
+
+    # Away from the kink of |action[1]| at 0, where a new policy begins.
+    params = jax.tree.map(lambda p: p + 0.1, state.learner.policy.params)
+    grads = jax.jit(jax.grad(loss))(params)
+    norm = jnp.sqrt(sum(jnp.vdot(g, g) for g in jax.tree.leaves(grads)))
+    size = 1e-2  # along the unit gradient, where the slope is the gradient's norm
+    moved = [jax.tree.map(lambda p, g, s=s: p + s * g / norm, params, grads) for s in (size, -size)]
+    slope = (jax.jit(loss)(moved[0]) - loss(moved[1])) / (2 * size)
+    # float32 rounding of the loss (6e-8 / 2e-2 = 3e-6) and the third derivative times size^2.
+    np.testing.assert_allclose(slope, norm, rtol=1e-2)
+
+
+def test_failed_environments_are_never_learned_from(iterate):
+    state, metrics, _ = run(iterate, make_probe(fail_at=5), 3)
+    assert 0.5 < float(metrics.invalid_share) < 1.0
+    assert all(bool(jnp.isfinite(x).all()) for x in jax.tree.leaves(state.learner.policy.params))
+    assert bool(jnp.isfinite(state.obs_stats.mean).all())
+
+
+def test_the_chattering_world_gets_a_useful_derivative():
+    class World:
+        integrator = "euler"
+
+        def replace(self, **changes):
+            return changes
+
+    assert trainer.training_env(World()) == {"integrator": "straight-through"}
+
+
+def test_refuses_what_cannot_be_differentiated():
+    with pytest.raises(UserError, match="--algo first-order needs --physics chain"):
+        replace(CONFIG, env=replace(CONFIG.env, physics="mjx"))
+
+
+def test_refuses_a_horizon_that_does_not_divide_the_episode():
+    message = "--episode-steps 1000 must be a multiple of --horizon-steps times --windows 70"
+    with pytest.raises(UserError, match=message):
+        replace(preset_config("fast", "first-order"), first_order=FirstOrderConfig(7, 10))
