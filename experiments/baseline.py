@@ -1,0 +1,44 @@
+"""The controllers without learning on the paper's five delays and four seas.
+
+    python experiments/baseline.py ik extrapolate preview
+
+Writes experiments/baseline_WHO.csv; for `ik` prints how close it is to the baseline that the
+paper's table 3 implies (rms of the 40 log ratios, worst cell).
+"""
+
+import math
+import sys
+import time
+
+from record import evaluation_rows, provenance, write_rows
+
+from mcx_jax import startup
+from mcx_jax.config import NAMED_DELAYS, EnvConfig, MotionConfig
+
+
+def main() -> None:
+    startup.configure()
+    from mcx_jax.controllers import CLASSICAL
+    from mcx_jax.evaluate import evaluate
+
+    for who in sys.argv[1:] or ["ik"]:
+        rows = []
+        for delay in NAMED_DELAYS:
+            begun = time.monotonic()
+            found = evaluate(who, CLASSICAL[who], EnvConfig(delay=delay), MotionConfig())
+            rows += evaluation_rows(found, time.monotonic() - begun)
+            print(f"{who} {delay}: {time.monotonic() - begun:.0f} s", flush=True)
+        if who == "ik":
+            ratios = [
+                math.log(float(r[name]) / float(r[f"{name}_paper"]))
+                for r in rows
+                for name in ("pos_mm", "ang_mrad")
+            ]
+            rms = math.sqrt(sum(x * x for x in ratios) / len(ratios))
+            worst = max(ratios, key=abs)
+            print(f"rms log ratio {rms:.3f}, worst cell {100 * (math.exp(worst) - 1):+.1f} %")
+        write_rows(f"baseline_{who}", [{**r, **provenance()} for r in rows])
+
+
+if __name__ == "__main__":
+    main()

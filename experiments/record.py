@@ -1,0 +1,60 @@
+"""What every stored result carries: the command, the commit, the machine and the versions."""
+
+import csv
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+FOLDER = Path(__file__).parent
+
+
+def provenance() -> dict[str, str]:
+    """Columns that end every row of a stored result."""
+    import jax
+    import mujoco
+
+    command = " ".join(["python", "experiments/" + Path(sys.argv[0]).name, *sys.argv[1:]])
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=FOLDER
+    ).stdout.strip()
+    device = f"{jax.devices()[0].platform}, {os.cpu_count()} cores"
+    versions = {"jax": jax.__version__, "mujoco": mujoco.__version__}
+    return {"command": command, "commit": commit, "device": device, **versions}
+
+
+def write_rows(name: str, rows: list[dict]) -> None:
+    """Write experiments/NAME.csv and say so."""
+    path = FOLDER / f"{name}.csv"
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    print(f"wrote {path.relative_to(FOLDER.parent)}")
+
+
+def evaluation_rows(rows: list[dict], seconds: float) -> list[dict]:
+    """Result rows of `mcx_jax.evaluate` as CSV rows, beside the paper's figures."""
+    from mcx_jax.results import paper_errors
+
+    out = []
+    for r in rows:
+        kind = "ik" if r["who"] == "ik" else "agent"
+        pos, ang = paper_errors(kind, r["delay"], r["sea"]) or (float("nan"), float("nan"))
+        out.append(
+            {
+                "who": r["who"],
+                "delay": r["delay"],
+                "sea": r["sea"],
+                "pos_mm": f"{r['pos_mm']['mean']:.3f}",
+                "pos_mm_paper": f"{pos:.2f}",
+                "ang_mrad": f"{r['ang_mrad']['mean']:.3f}",
+                "ang_mrad_paper": f"{ang:.2f}",
+                "pos_mm_max": f"{r['pos_mm']['max']:.2f}",
+                "ang_mrad_max": f"{r['ang_mrad']['max']:.2f}",
+                "invalid": r["invalid_episodes"],
+                "episodes": r["episodes"],
+                "seconds": f"{seconds:.0f}",
+            }
+        )
+    return out
