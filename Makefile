@@ -13,7 +13,7 @@ VENV := .venv
 PY   := $(VENV)/bin/python
 PIP  := $(PY) -m pip install --disable-pip-version-check --progress-bar off -c constraints.txt
 
-.PHONY: help train test check format bench clean
+.PHONY: help train test check format clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -36,9 +36,6 @@ check: $(VENV)/.dev  ## lint, format and types only
 format: $(VENV)/.dev  ## mend what ruff can mend
 	$(PY) -m ruff check --fix .
 	$(PY) -m ruff format .
-
-bench: $(VENV)/.run  ## speed of physics, environment and training on this machine
-	$(PY) -m mcx_jax.bench $(ARGS)
 
 clean:  ## remove caches and build products; keeps .venv and runs/
 	rm -rf build dist .pytest_cache .ruff_cache .hypothesis *.egg-info MUJOCO_LOG.TXT

@@ -1,0 +1,118 @@
+"""Regenerate the tables of README.md from the stored results.
+
+    python experiments/readme_tables.py [--check]
+
+Each block stands between `<!-- table:NAME -->` and `<!-- end -->`.
+"""
+
+import csv
+import re
+import sys
+from pathlib import Path
+
+FOLDER = Path(__file__).parent
+README = FOLDER.parent / "README.md"
+SEAS = ("Wa", "Wb", "Wc", "Wd")
+DELAYS = ("E0", "B4_21", "E1", "B4_4", "E2")
+
+
+def read(name: str) -> list[dict[str, str]]:
+    """Rows of experiments/NAME.csv; none if it was not measured yet."""
+    path = FOLDER / f"{name}.csv"
+    if not path.is_file():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def source(row: dict[str, str]) -> str:
+    return f"`{row['command']}` (commit {row['commit']}, {row['device']}, jax {row['jax']})"
+
+
+def markdown(header: list[str], rows: list[list[str]]) -> str:
+    lines = ["| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
+    return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+
+
+def baseline() -> str:
+    """The IK baseline beside the one that table 3 implies."""
+    cells = {(r["delay"], r["sea"]): r for r in read("baseline_ik")}
+    if not cells:
+        return "not measured yet (`python experiments/baseline.py ik`)"
+    rows = []
+    for delay in DELAYS:
+        row = [delay]
+        for unit in ("pos_mm", "ang_mrad"):
+            row += [
+                f"{float(cells[delay, s][unit]):.2f} / {cells[delay, s][unit + '_paper']}"
+                for s in SEAS
+            ]
+        rows.append(row)
+    header = ["delay", *(f"{s} mm" for s in SEAS), *(f"{s} mrad" for s in SEAS)]
+    return markdown(header, rows) + "\n\nSource: " + source(next(iter(cells.values())))
+
+
+def controllers() -> str:
+    """B4_4: everybody side by side."""
+    everyone = []
+    for name in ("baseline_ik", "baseline_extrapolate", "baseline_preview"):
+        everyone += [r for r in read(name) if r["delay"] == "B4_4"]
+    for name in ("train_2m", "first_order"):
+        everyone += [{**r, "trained": r["steps"]} for r in read(name) if r["who"] != "ik"]
+    if not everyone:
+        return "not measured yet (`python experiments/baseline.py ik extrapolate preview`)"
+    rows = []
+    for who in dict.fromkeys(r["who"] for r in everyone):
+        cells = {r["sea"]: r for r in everyone if r["who"] == who}
+        first = cells["Wa"]
+        label = who
+        if "trained" in first:
+            label = f"{who}, {int(first['steps']) / 1e6:.1f} M steps, {first['train_seconds']} s"
+        values = [
+            f"{float(cells[s]['pos_mm']):.2f} mm, {float(cells[s]['ang_mrad']):.2f} mrad"
+            for s in SEAS
+        ]
+        rows.append([label, *values])
+    agents = {r["sea"]: r for r in everyone if r["who"] == "preview"}
+    if agents:
+        paper = [
+            f"{agents[s]['pos_mm_paper']} mm, {agents[s]['ang_mrad_paper']} mrad" for s in SEAS
+        ]
+        rows.append(["paper's agents, 20 M steps", *paper])
+    commands = "; ".join(dict.fromkeys(source(r) for r in everyone))
+    return markdown(["B4_4", *SEAS], rows) + "\n\nSource: " + commands
+
+
+def observation() -> str:
+    """The observation's table, from the code."""
+    from mcx_jax.envs.observe import OBS_TABLE
+
+    rows, start = [], 0
+    for row in OBS_TABLE:
+        rows.append([f"{start}..{start + row.size - 1}", f"`{row.name}`", row.unit, row.meaning])
+        start += row.size
+    return markdown(["index", "name", "unit", "meaning"], rows)
+
+
+TABLES = {"baseline": baseline, "controllers": controllers, "observation": observation}
+
+
+def regenerate(text: str) -> str:
+    """README with every block made anew."""
+
+    def block(match: re.Match[str]) -> str:
+        return f"<!-- table:{match[1]} -->\n{TABLES[match[1]]()}\n<!-- end -->"
+
+    return re.sub(r"<!-- table:(\w+) -->\n.*?<!-- end -->", block, text, flags=re.DOTALL)
+
+
+def main() -> None:
+    text = README.read_text()
+    new = regenerate(text)
+    if "--check" in sys.argv and new != text:
+        raise SystemExit("README.md's tables differ from the stored results: run this script")
+    README.write_text(new)
+
+
+if __name__ == "__main__":
+    main()
