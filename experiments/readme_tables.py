@@ -6,6 +6,7 @@ Each block stands between `<!-- table:NAME -->` and `<!-- end -->`.
 """
 
 import csv
+import math
 import re
 import sys
 from pathlib import Path
@@ -32,6 +33,34 @@ def source(row: dict[str, str]) -> str:
 def markdown(header: list[str], rows: list[list[str]]) -> str:
     lines = ["| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
     return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
+
+
+def headline() -> str:
+    """The three numbers of the first screen."""
+    rows = []
+    cells = read("baseline_ik")
+    if cells:
+        names = ("pos_mm", "ang_mrad")
+        ratios = [math.log(float(r[n]) / float(r[f"{n}_paper"])) for r in cells for n in names]
+        rms = math.sqrt(sum(x * x for x in ratios) / len(ratios))
+        worst = 100 * (math.exp(max(ratios, key=abs)) - 1)
+        value = f"rms log ratio {rms:.3f}, worst cell {worst:+.0f} %"
+        rows.append(
+            ["IK baseline against table 3's implied one, 40 cells", value, source(cells[0])]
+        )
+    for name, label in (("train_2m", "PPO"), ("first_order", "gradient through the simulator")):
+        found = {(r["who"] == "ik", r["sea"]): r for r in read(name)}
+        if not found:
+            continue
+        gains = [
+            100 * (1 - float(found[False, s]["pos_mm"]) / float(found[True, s]["pos_mm"]))
+            for s in SEAS
+        ]
+        one = found[False, "Wa"]
+        what = f"{label}, delay B4_4, {int(one['steps']) / 1e6:.1f} M control steps"
+        value = f"position error {min(gains):.0f} to {max(gains):.0f} % below the baseline's"
+        rows.append([what, value, source(one)])
+    return markdown(["what", "here", "command"], rows)
 
 
 def baseline() -> str:
@@ -94,7 +123,12 @@ def observation() -> str:
     return markdown(["index", "name", "unit", "meaning"], rows)
 
 
-TABLES = {"baseline": baseline, "controllers": controllers, "observation": observation}
+TABLES = {
+    "headline": headline,
+    "baseline": baseline,
+    "controllers": controllers,
+    "observation": observation,
+}
 
 
 def regenerate(text: str) -> str:

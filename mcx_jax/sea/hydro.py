@@ -45,8 +45,8 @@ class VesselKnobs:
 
     Reached: all eight means within 9 %, rms log error 0.052 (`python -m mcx_jax.sea`). Roll damping
     0.08 would give 5 % and 0.025, but the errors of the IK baseline in the paper's table 3 decide:
-    with 0.05 its 40 cells are met with an rms log ratio of 0.057, with 0.08 only 0.080 (orientation
-    10 % low). Other sets do as well (for instance heading 172.5, damping 0.30, roll 0.05, 6 m up):
+    in one draw of episodes its 40 cells were met with an rms log ratio of 0.057, with 0.08 only 0.080
+    (orientation 10 % low). Other sets do as well (for instance heading 172.5, damping 0.30, roll 0.05, 6 m up):
     these numbers cannot tell them apart.
     """
 
