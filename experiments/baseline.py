@@ -21,7 +21,10 @@ def main() -> None:
     from mcx_jax.controllers import CLASSICAL
     from mcx_jax.evaluate import evaluate
 
-    for who in sys.argv[1:] or ["ik"]:
+    names = sys.argv[1:] or ["ik"]
+    if unknown := set(names) - set(CLASSICAL):
+        raise SystemExit(f"unknown controller {unknown}: use {', '.join(CLASSICAL)}")
+    for who in names:
         rows = []
         for delay in NAMED_DELAYS:
             begun = time.monotonic()

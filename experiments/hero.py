@@ -2,7 +2,7 @@
 
     MUJOCO_GL=osmesa PYOPENGL_PLATFORM=osmesa python experiments/hero.py
 
-Needs an off-screen OpenGL (Debian: libosmesa6) and imageio or matplotlib for the PNG.
+Needs an off-screen OpenGL (Debian: libosmesa6) and matplotlib.
 """
 
 from pathlib import Path

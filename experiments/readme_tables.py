@@ -123,11 +123,32 @@ def observation() -> str:
     return markdown(["index", "name", "unit", "meaning"], rows)
 
 
+def presets() -> str:
+    """Where the presets differ, from the code."""
+    from dataclasses import fields
+
+    from mcx_jax.config import preset_config
+
+    fast, paper = preset_config("fast"), preset_config("paper")
+    rows = [["`--num-envs`", str(fast.num_envs), str(paper.num_envs)]]
+    rows.append(["`--episode-steps`", *(str(c.env.episode_steps) for c in (fast, paper))])
+    for field in fields(fast.ppo):
+        ours, theirs = getattr(fast.ppo, field.name), getattr(paper.ppo, field.name)
+        if ours != theirs:
+            rows.append([f"`--{field.name.replace('_', '-')}`", _short(ours), _short(theirs)])
+    return markdown(["setting", "`fast` (default)", "`paper`"], rows)
+
+
+def _short(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
 TABLES = {
     "headline": headline,
     "baseline": baseline,
     "controllers": controllers,
     "observation": observation,
+    "presets": presets,
 }
 
 

@@ -27,6 +27,7 @@ else:
 CHEAP = (
     "test_assets",
     "test_packaging",
+    "test_readme",
     "test_config",
     "test_cli",
     "test_spatial",

@@ -45,9 +45,10 @@ class VesselKnobs:
 
     Reached: all eight means within 9 %, rms log error 0.052 (`python -m mcx_jax.sea`). Roll damping
     0.08 would give 5 % and 0.025, but the errors of the IK baseline in the paper's table 3 decide:
-    in one draw of episodes its 40 cells were met with an rms log ratio of 0.057, with 0.08 only 0.080
-    (orientation 10 % low). Other sets do as well (for instance heading 172.5, damping 0.30, roll 0.05, 6 m up):
-    these numbers cannot tell them apart.
+    on the same episodes its 40 cells were met with an rms log ratio of 0.057 instead of 0.080,
+    whose orientation was 10 % low (other episodes since: `experiments/baseline_ik.csv`). Other sets
+    do as well (for instance heading 172.5, damping 0.30, roll 0.05, 6 m up): these numbers cannot
+    tell them apart.
     """
 
     heading_deg: float = 170.0
