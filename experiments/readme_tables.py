@@ -108,7 +108,7 @@ def controllers() -> str:
             f"{agents[s]['pos_mm_paper']} mm, {agents[s]['ang_mrad_paper']} mrad" for s in SEAS
         ]
         rows.append(["paper's agents, 20 M steps", *paper])
-    commands = "; ".join(dict.fromkeys(source(r) for r in everyone))
+    commands = "; ".join({r["command"]: source(r) for r in everyone}.values())
     return markdown(["B4_4", *SEAS], rows) + "\n\nSource: " + commands
 
 

@@ -47,10 +47,11 @@ class RunDir:
 
 
 def default_path(config: TrainConfig) -> Path:
-    """runs/<delay>-<preset>-s<seed>, or -s<first>-<last> for several seeds."""
+    """runs/<delay>-<preset or first-order>-s<seed>, or -s<first>-<last> for several seeds."""
     last = f"-{config.seed + config.seeds - 1}" if config.seeds > 1 else ""
     delay = config.env.delay.replace(":", "_")
-    return Path("runs") / f"{delay}-{config.preset}-s{config.seed}{last}"
+    kind = config.preset if config.algo == "ppo" else config.algo
+    return Path("runs") / f"{delay}-{kind}-s{config.seed}{last}"
 
 
 def stored_config(path: Path) -> TrainConfig:

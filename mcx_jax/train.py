@@ -36,7 +36,7 @@ class TrainCommand:
     """Train a policy that corrects the arm's goal against the delay of its actuation."""
 
     run_dir: str = ""
-    """Directory of the run; default runs/<delay>-<preset>-s<seed>."""
+    """Directory of the run; default runs/<delay>-<preset or first-order>-s<seed>."""
     resume: bool = False
     """Go on with the run in --run-dir from its last checkpoint, exactly as if never stopped."""
     smoke: bool = False
