@@ -211,7 +211,7 @@ def test_strange_directories(tmp_path, capsys):
     [
         ("--preset slow", "unknown preset 'slow': use fast or paper"),
         ("--total-steps 0", "--total-steps 0: must be a positive integer"),
-        ("--algo sac", "--algo sac: use one of ppo"),
+        ("--algo sac", "--algo sac: use one of ppo, first-order"),
         ("--device tpu", "--device tpu: use one of auto, cpu, gpu"),
         ("--resum", "unknown option --resum: did you mean --resume? --help lists all"),
         ("--num-envs 2.5", "--num-envs 2.5: must be a whole number"),
