@@ -355,6 +355,7 @@ def preset_config(preset: str, algo: str = "ppo") -> TrainConfig:
         raise UserError(f"unknown preset '{preset}': use fast or paper")
     paper_env = EnvConfig(episode_steps=1000)
     if algo == "first-order":
+        _require(preset == "fast", "--preset paper is PPO's schedule: leave it out of first-order")
         # 256 environments: the gradient has no exploration noise to average out.
         return TrainConfig(algo="first-order", num_envs=256, total_steps=5_000_000, env=paper_env)
     if preset == "fast":

@@ -1,4 +1,4 @@
-"""Controllers without learning: what a correction policy has to beat, and the bound.
+"""Controllers without learning: what a correction policy has to beat.
 
 A controller is `init(env, state) -> memory` and `act(env, state, memory) -> (memory, action)`, both
 for ONE episode; a trained policy has the same two functions (`mcx_jax.policy.PolicyController`).
@@ -80,7 +80,8 @@ class Extrapolate:
 
 @struct.dataclass
 class Preview:
-    """The true future pose of the goal, as if the motion were known in advance: the bound."""
+    """The true future pose of the goal, as if the motion were known in advance: what aiming a fixed
+    lead ahead can reach. A policy that also learns the servo's own error can be better."""
 
     lead_s: float | None = struct.field(pytree_node=False, default=None)
     """How far ahead, s, rounded to 2 ms; None = the delay's group delay plus 10 ms."""

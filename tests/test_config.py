@@ -199,6 +199,10 @@ REFUSED = {
         lambda: fast(env=EnvConfig(episode_steps=1000)),
         "--episode-steps 1000 must be a multiple of --window-steps 32",
     ),
+    "paper's schedule is PPO's": (
+        lambda: preset_config("paper", "first-order"),
+        "--preset paper is PPO's schedule: leave it out of first-order",
+    ),
     "preset": (lambda: preset_config("slow"), "unknown preset 'slow': use fast or paper"),
 }
 
