@@ -1,0 +1,45 @@
+"""Process set-up: the XLA flag by version, never over the user's own, and the one-line errors."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from mcx_jax.errors import UserError
+from mcx_jax.startup import FUSION_FLAG, run_command, xla_flags_for
+
+
+@pytest.mark.parametrize(
+    ("version", "current", "want"),
+    [
+        ("0.7.2", "", ""),
+        ("0.8.0", "", f"{FUSION_FLAG}=false"),
+        ("0.10.2", "--xla_a=1", f"--xla_a=1 {FUSION_FLAG}=false"),
+        ("0.11.1", "", f"{FUSION_FLAG}=false"),
+        ("0.11.2", "", ""),  # from here on the flag aborts the process
+        ("0.12.0.dev20261101", "", ""),
+        ("0.10.2", f"{FUSION_FLAG}=true", f"{FUSION_FLAG}=true"),  # the user's word stands
+    ],
+)
+def test_the_fusion_flag_goes_by_version(version, current, want):
+    assert xla_flags_for(version, current) == want
+
+
+def test_a_users_mistake_is_one_line_and_code_2(capsys):
+    def main():
+        raise UserError("what, allowed, do")
+
+    with pytest.raises(SystemExit) as stop:
+        run_command(main)
+    assert stop.value.code == 2
+    assert capsys.readouterr().err == "error: what, allowed, do\n"
+
+
+def test_import_sets_no_flag():
+    code = (
+        "import os, mcx_jax.train, mcx_jax.evaluate; "
+        "assert 'fusion' not in os.environ.get('XLA_FLAGS', '')"
+    )
+    clean = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+    subprocess.run([sys.executable, "-c", code], check=True, env=clean)
