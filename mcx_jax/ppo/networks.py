@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mcx_jax.ppo.dense import Dense
 from mcx_jax.ppo.lstm import LSTM
 
 Params = Any
@@ -49,10 +50,10 @@ class RecurrentNet(nn.Module):
     head_scale: float = 1.0
 
     def setup(self) -> None:
-        self.dense = [nn.Dense(self.hidden) for _ in range(2)]
+        self.dense = [Dense(self.hidden) for _ in range(2)]
         self.cell = make_cell(self.hidden)
         scale = nn.initializers.variance_scaling(self.head_scale**2, "fan_in", "normal")
-        self.head = nn.Dense(self.outputs, kernel_init=scale)
+        self.head = Dense(self.outputs, kernel_init=scale)
 
     def step(self, carry: Carry, obs: jax.Array) -> tuple[Carry, jax.Array]:
         """obs (..., F) -> carry, head output (..., O)."""
