@@ -1,0 +1,1 @@
+"""`python -m mcx_jax.bench`: how fast everything is, rivals included, in one run."""

@@ -1,0 +1,180 @@
+"""`python -m mcx_jax.bench`: every engine, the environment, the rollout, training, compile times.
+
+All in one run, rivals included; medians of five; compile times apart.
+"""
+
+import json
+import os
+import resource
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from mcx_jax.errors import UserError
+
+ENVS = (1, 4, 16, 64, 256, 512, 1024, 2048, 4096, 8192, 16384)
+QUICK_ENVS = (1, 64, 2048)
+FEW_ENVS = (1, 64, 2048, 8192)
+"""For MJX, whose larger batches take minutes and tell nothing new."""
+ENVIRONMENT_ENVS = (512, 2048, 16384)
+RATIO_ENVS = 2048
+"""Where chain and MJX are compared."""
+
+
+@dataclass(frozen=True)
+class BenchConfig:
+    """How fast everything is on this machine, rivals included, in one run. Let nothing else run."""
+
+    quick: bool = False
+    """Fewer batch sizes and no cold start; under two minutes on two cores."""
+    json: str = ""
+    """Write the figures to this file; - or no value: to the terminal, and the report to stderr."""
+    plot: str = ""
+    """Also draw steps/s against number of environments into this .png or .svg file."""
+    device: Literal["auto", "cpu", "gpu"] = "auto"
+    """Where to run; auto = GPU if JAX has one."""
+
+
+def run(quick: bool, say) -> dict[str, Any]:
+    """All figures as plain numbers (see README).
+
+    Args:
+        quick: fewer batch sizes, no cold start.
+        say: prints a line of progress.
+    """
+    from dataclasses import asdict
+
+    from mcx_jax.bench import physics, program, startup_time
+    from mcx_jax.config import TrainConfig
+
+    figures: dict[str, Any] = {"device": device(), "versions": versions()}
+    figures["physics"] = rows = []
+    for engine, speed in physics.ENGINES.items():
+        for envs in QUICK_ENVS if quick else FEW_ENVS if engine == "mjx" else ENVS:
+            rows.append({"engine": engine, "envs": envs, "steps_per_s": speed(envs)})
+            say(f"{engine:>10} {envs:6d} environments: {rows[-1]['steps_per_s']:12,.0f} steps/s")
+    figures["ratio"] = ratios(rows)
+    for name, value in figures["ratio"].items():
+        say(f"{name.replace('_', ' ')}: {value:.1f} times")
+    figures["gradient_over_forward"] = physics.gradient_over_forward(RATIO_ENVS)
+    say(f"gradient of ten physics steps: {figures['gradient_over_forward']:.1f} times forward")
+
+    config = TrainConfig()
+    env = program.build(config)
+    figures["environment"] = []
+    for envs in (RATIO_ENVS,) if quick else ENVIRONMENT_ENVS:
+        us = program.environment_us(env, envs)
+        figures["environment"].append({"envs": envs, "steps_per_s": 1e6 / us, "us_per_step": us})
+        say(f"environment, {envs} environments: {1e6 / us:,.0f} control steps/s ({us:.2f} us)")
+    speeds = {row["envs"]: row["steps_per_s"] for row in figures["environment"]}
+    figures["environment_steps_per_s"] = speeds[RATIO_ENVS]
+    figures["breakdown_us"] = program.breakdown_us(env, RATIO_ENVS)
+    parts = ", ".join(f"{name} {us:.2f}" for name, us in figures["breakdown_us"].items())
+    say(f"parts of a control step alone, us: {parts}")
+    figures["peak_memory_gib"] = peak_memory_gib()
+    say(f"peak memory so far, no learner: {figures['peak_memory_gib']:.2f} GiB")
+
+    speed = program.training_speed(config, env)
+    figures.update(asdict(speed))
+    figures["matmul_gflops"] = program.matmul_gflops()
+    figures["learner_matmul_share"] = speed.learner_gflops / figures["matmul_gflops"]
+    say(f"rollout with policy: {speed.rollout_steps_per_s:,.0f} control steps/s")
+    say(f"training, learning included: {speed.training_steps_per_s:,.0f} control steps/s")
+    say(
+        f"learner: {speed.learner_gflops:.0f} GFlop/s of the machine's "
+        f"{figures['matmul_gflops']:.0f}: {100 * figures['learner_matmul_share']:.0f} %"
+    )
+    figures["compile_s"] = {"cold": None, "warm": None}
+    if not quick:
+        figures["compile_s"] = startup_time.first_metrics_s()
+        say(
+            "command to first metrics: {cold:.0f} s cold, {warm:.0f} s warm".format(
+                **figures["compile_s"]
+            )
+        )
+    return figures
+
+
+def ratios(rows: list[dict[str, Any]]) -> dict[str, float]:
+    """How many times faster the chain engine is: best batch against C's best, and against MJX."""
+
+    def best(*engines: str) -> float:
+        return max(row["steps_per_s"] for row in rows if row["engine"] in engines)
+
+    def at(engine: str) -> float:
+        chosen = [r for r in rows if r["engine"] == engine and r["envs"] == RATIO_ENVS]
+        return chosen[0]["steps_per_s"]
+
+    return {
+        "chain_over_c": best("chain") / best("c-rollout", "c-batch"),
+        "chain_over_mjx": at("chain") / at("mjx"),
+    }
+
+
+def device() -> str:
+    """The machine in words."""
+    import jax
+
+    found = jax.devices()[0]
+    kind = cpu_name() if found.platform == "cpu" else found.device_kind
+    return f"{kind}, {os.cpu_count()} CPU cores"
+
+
+def cpu_name() -> str:
+    """The processor's name as Linux gives it, or `cpu`."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return "cpu"
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else "cpu"
+
+
+def versions() -> dict[str, str]:
+    """Of what the figures depend on."""
+    from importlib.metadata import version
+
+    packages = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
+    return {"python": sys.version.split()[0], **{name: version(name) for name in packages}}
+
+
+def peak_memory_gib() -> float:
+    """Peak resident memory of this process."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Command line."""
+    from mcx_jax import cli, startup
+
+    argv = list(sys.argv[1:] if argv is None else argv)
+    config = cli.parse(BenchConfig, cli.optional_value(argv, "--json", "-"), prog="bench")
+    for flag, path in (("--json", config.json), ("--plot", config.plot)):
+        if path not in ("", "-") and not Path(path).parent.is_dir():
+            raise UserError(f"{flag} {path}: no such directory")
+    if config.plot and Path(config.plot).suffix not in (".png", ".svg"):
+        raise UserError(f"--plot {config.plot}: the name must end in .png or .svg")
+    report = sys.stderr if config.json == "-" else sys.stdout
+
+    def say(line: str) -> None:
+        print(line, file=report, flush=True)
+
+    for line in startup.configure(config.device):
+        say(line)
+    figures = run(config.quick, say)
+    text = json.dumps(figures, indent=1)
+    if config.json == "-":
+        print(text)
+    elif config.json:
+        Path(config.json).write_text(text + "\n")
+    if config.plot:
+        from mcx_jax.bench.plot import draw
+
+        draw(figures, Path(config.plot))
+
+
+if __name__ == "__main__":
+    from mcx_jax.startup import run_command
+
+    run_command(main)

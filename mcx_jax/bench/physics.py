@@ -1,0 +1,138 @@
+"""Physics steps per second of every engine on the same arm: C MuJoCo (rollout and batch, all
+cores), MJX and the chain engine.
+
+Same task for all: the paper's arm, Euler, base at rest, servo references held, from random joint
+angles; what one control step asks of the physics, ten steps of 2 ms, is the unit of a call.
+"""
+
+import os
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from mcx_jax.bench.timing import median_s
+from mcx_jax.config import SUBSTEPS
+from mcx_jax.envs import chain
+from mcx_jax.envs.model import ChainModel, chain_model, load_mujoco
+
+AT_REST = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 9.81))
+"""`chain.BaseState` of a level base at rest."""
+LARGE_STEPS = 100_000
+"""Physics steps in a call, all environments together, at least, where a control step is less."""
+
+
+def start(model: mujoco.MjModel, envs: int) -> tuple[np.ndarray, np.ndarray]:
+    """(envs, nq) joint angles, rad, and (envs, nu) commands that hold them."""
+    q = np.random.default_rng(0).uniform(-1.0, 1.0, (envs, model.nq))
+    ctrl = np.zeros((envs, model.nu))
+    for i in range(model.nu):
+        if model.actuator_biasprm[i, 1]:  # a position servo
+            ctrl[:, i] = q[:, model.actuator_trnid[i, 0]]
+    return q, ctrl
+
+
+def c_rollout(envs: int) -> float:
+    """Physics steps/s of `mujoco.rollout` on all cores."""
+    from mujoco import rollout
+
+    model = load_mujoco("paper")
+    threads = os.cpu_count() or 1
+    datas = [mujoco.MjData(model) for _ in range(threads)]
+    q, ctrl = start(model, envs)
+    state = np.zeros((envs, mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
+    state[:, 1 : 1 + model.nq] = q  # time comes first
+    steps = _steps_a_call(envs, 10_000)
+    control = np.repeat(ctrl[:, None], steps, axis=1)
+    with rollout.Rollout(nthread=threads) as pool:
+        seconds = median_s(lambda: pool.rollout(model, datas, state, control))
+    return envs * steps / seconds
+
+
+def c_batch(envs: int) -> float:
+    """Physics steps/s of `mujoco.batch` on all cores."""
+    from mujoco.batch import Batch
+
+    model = load_mujoco("paper")
+    batch = Batch(model, nsim=envs, nthread=os.cpu_count() or 1)
+    q, ctrl = start(model, envs)
+    batch.bind("qpos")[:], batch.bind("ctrl")[:] = q, ctrl
+    steps = _steps_a_call(envs, 10_000)
+    return envs * steps / median_s(lambda: batch.step(nstep=steps))
+
+
+def mjx(envs: int) -> float:
+    """Physics steps/s of MJX, without contact and constraint work."""
+    from mujoco import mjx as mj_x
+
+    model = load_mujoco("paper")
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    m = mj_x.put_model(model)
+    blank = mj_x.make_data(m)
+
+    def run(q, v, ctrl):
+        d = blank.replace(qpos=q, qvel=v, ctrl=ctrl)
+        d = jax.lax.fori_loop(0, SUBSTEPS, lambda _, d: mj_x.step(m, d), d)
+        return d.qpos, d.qvel
+
+    q, ctrl = (jnp.asarray(x, jnp.float32) for x in start(model, envs))
+    step = jax.jit(jax.vmap(run))
+    return envs * SUBSTEPS / _jax_s(step, (q, jnp.zeros_like(q)), ctrl)
+
+
+def chain_engine(envs: int) -> float:
+    """Physics steps/s of this project's engine."""
+    mj = load_mujoco("paper")
+    q, ctrl = (jnp.asarray(x.T, jnp.float32) for x in start(mj, envs))
+    steps = _steps_a_call(envs, LARGE_STEPS)
+    wall = jnp.asarray(True) if jax.default_backend() == "cpu" else None
+    step = jax.jit(partial(_chain_steps, chain_model(mj, "tool"), "euler", steps))
+    return envs * steps / _jax_s(step, (q, jnp.zeros_like(q)), ctrl, wall)
+
+
+ENGINES: dict[str, Callable[[int], float]] = {
+    "c-rollout": c_rollout,
+    "c-batch": c_batch,
+    "mjx": mjx,
+    "chain": chain_engine,
+}
+
+
+def gradient_over_forward(envs: int) -> float:
+    """Time of the gradient of ten physics steps (implicitfast) by the state over the time of the
+    steps themselves."""
+    mj = load_mujoco("paper")
+    q, ctrl = (jnp.asarray(x.T, jnp.float32) for x in start(mj, envs))
+    v = jnp.zeros_like(q)
+    wall = jnp.asarray(True) if jax.default_backend() == "cpu" else None
+    run = partial(_chain_steps, chain_model(mj, "tool"), "implicitfast", SUBSTEPS)
+
+    def loss(q, v, ctrl, wall):
+        q, v = run(q, v, ctrl, wall)
+        return jnp.sum(q**2) + jnp.sum(v**2)
+
+    forward = _jax_s(jax.jit(run), (q, v), ctrl, wall)
+    return _jax_s(jax.jit(jax.grad(loss, argnums=(0, 1))), (q, v), ctrl, wall) / forward
+
+
+def _chain_steps(model: ChainModel, integrator: str, steps: int, q, v, ctrl, wall):
+    """`steps` physics steps of environments on the last axis."""
+
+    def one(q, v, ctrl):
+        base = jax.tree.map(jnp.float32, AT_REST)
+        return chain.substeps(model, integrator, q, v, ctrl, lambda _: base, steps, wall)
+
+    return jax.vmap(one, in_axes=-1, out_axes=-1)(q, v, ctrl)
+
+
+def _steps_a_call(envs: int, at_least: int) -> int:
+    return SUBSTEPS * max(1, at_least // (SUBSTEPS * envs))
+
+
+def _jax_s(step: Callable, state: tuple, *constants) -> float:
+    """Median seconds of `step(*state, *constants)`, from the same state each time."""
+    return median_s(lambda: jax.block_until_ready(step(*state, *constants)))

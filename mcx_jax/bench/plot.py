@@ -1,0 +1,48 @@
+"""Steps per second against the number of environments, all engines, log-log."""
+
+from pathlib import Path
+from typing import Any
+
+from mcx_jax.errors import UserError
+
+STYLES = {
+    "chain": ("mcx_jax chain engine", "#0b6e4f", "o"),
+    "c-batch": ("C MuJoCo, mujoco.batch", "#c8553d", "s"),
+    "c-rollout": ("C MuJoCo, mujoco.rollout", "#e8a33d", "^"),
+    "mjx": ("MuJoCo MJX", "#4a6fa5", "D"),
+}
+
+
+def draw(figures: dict[str, Any], path: Path) -> None:
+    """Draw the physics rows of a bench result.
+
+    Raises:
+        UserError: matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise UserError("--plot needs matplotlib: pip install 'mcx_jax[viz]'") from None
+    figure = Figure(figsize=(8, 4.6), layout="constrained")
+    axes = figure.subplots()
+    for engine, (label, colour, marker) in STYLES.items():
+        rows = [row for row in figures["physics"] if row["engine"] == engine]
+        envs, speed = [r["envs"] for r in rows], [r["steps_per_s"] for r in rows]
+        axes.loglog(envs, speed, color=colour, marker=marker, ms=5, lw=1.8)
+        axes.annotate(
+            label,
+            (envs[-1], speed[-1]),
+            xytext=(8, 0),
+            textcoords="offset points",
+            color=colour,
+            va="center",
+            fontsize=9,
+        )
+    axes.set_xlabel("environments at once")
+    axes.set_ylabel("physics steps of 2 ms, per second")
+    axes.set_title("UR10e physics: " + figures["device"], fontsize=10, loc="left")
+    axes.grid(True, which="major", color="0.88")
+    axes.spines[["top", "right"]].set_visible(False)
+    low, high = axes.get_xlim()
+    axes.set_xlim(low, high * 30)  # room for the labels
+    figure.savefig(path, dpi=150)

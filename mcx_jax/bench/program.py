@@ -1,0 +1,165 @@
+"""The compiled program piece by piece: environment, rollout, learner, whole training iteration."""
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mcx_jax.bench.timing import median_s
+from mcx_jax.config import CONTROL_DT_S, SUBSTEPS, TrainConfig
+from mcx_jax.envs import ik, lag, observe, vessels
+from mcx_jax.envs.v2v import ArmState, EnvState, V2VEnv, make_env
+from mcx_jax.ppo import rollout, trainer
+from mcx_jax.ppo.experience import judge
+from mcx_jax.ppo.update import learn
+from mcx_jax.spatial import unpack, unpack_matrix
+from mcx_jax.stage import stage
+
+STEPS = 10
+"""Control steps in a timed call of the environment."""
+
+
+def build(config: TrainConfig) -> V2VEnv:
+    """The environment of a training run."""
+    return make_env(config.env, config.motion)
+
+
+def reset(env: V2VEnv, envs: int) -> EnvState:
+    """Environments at the start of an episode, leaves (..., envs)."""
+    return jax.jit(partial(rollout.reset_all, num_envs=envs))(env, jax.random.key(0))
+
+
+def environment_us(env: V2VEnv, envs: int) -> float:
+    """Microseconds of one control step of one environment, no policy."""
+    return _environment_us(env, reset(env, envs), V2VEnv.step)
+
+
+def breakdown_us(env: V2VEnv, envs: int) -> dict[str, float]:
+    """Microseconds that each part of a control step takes alone; they share caches and compiled
+    loops in the whole, so they need not add up to it."""
+    state = reset(env, envs)
+    return {name: _environment_us(env, state, part) for name, part in PARTS.items()}
+
+
+def _environment_us(env: V2VEnv, state: EnvState, step) -> float:
+    envs = state.step.shape[0]
+    action = jnp.zeros((6,))
+
+    def many(env, state):
+        one = jax.vmap(partial(step, env), in_axes=(-1, None), out_axes=-1)
+        return jax.lax.fori_loop(0, STEPS, lambda _, s: one(s, action), state)
+
+    run = jax.jit(many)
+    return 1e6 * median_s(lambda: jax.block_until_ready(run(env, state))) / (STEPS * envs)
+
+
+def _arm(env: V2VEnv, state: EnvState, _) -> EnvState:
+    deck, _ = env._segments(state.track, state.step)
+    rate = jnp.zeros_like(state.reference)
+    return replace(state, arm=env._simulate(state.arm, state.reference, rate, deck, SUBSTEPS))
+
+
+def _ik(env: V2VEnv, state: EnvState, _) -> EnvState:
+    goal = unpack_matrix(state.goal_rotation), unpack(state.goal_position, 3)
+    found = ik.solve(env.model, state.arm.q, goal, ik.WARM_ITERATIONS, env.wall)
+    return replace(state, arm=ArmState(q=found.q, qd=state.arm.qd))
+
+
+def _vessels(env: V2VEnv, state: EnvState, _) -> EnvState:
+    a, b = env._segments(state.track, state.step)
+    _, position = stage(env.wall, vessels.goal_in_base, a, b, state.goal_m, SUBSTEPS)
+    return replace(state, goal_position=jnp.stack(position), step=state.step + 1)
+
+
+def _lag(env: V2VEnv, state: EnvState, _) -> EnvState:
+    late, reference = lag.apply(env.delay, state.lag, state.arm.q)
+    rate = (reference - state.reference) / CONTROL_DT_S
+    return replace(state, lag=late, reference=reference + 0.0 * rate)
+
+
+def _observe(env: V2VEnv, state: EnvState, _) -> EnvState:
+    goal = unpack_matrix(state.goal_rotation), unpack(state.goal_position, 3)
+    tool = ik.tool_pose(env.model, unpack(state.arm.q, env.model.nq), env.wall)
+    errors = stage(env.wall, observe.tracking_error, goal, tool)
+    return replace(state, obs=observe.observe(goal, tool, errors), reward=-(errors[0] + errors[1]))
+
+
+PARTS = {"arm": _arm, "ik": _ik, "vessels": _vessels, "lag": _lag, "observe": _observe}
+
+
+@dataclass(frozen=True)
+class TrainingSpeed:
+    """Control steps/s, and the learner beside the machine's matrix products."""
+
+    rollout_steps_per_s: float
+    training_steps_per_s: float
+    learner_us_per_step: float
+    learner_gflops: float
+    """Useful floating-point operations of the learner's matrix products, 1e9/s."""
+
+
+def training_speed(config: TrainConfig, env: V2VEnv) -> TrainingSpeed:
+    """Time the rollout, the learner and the whole iteration of PPO."""
+    # The KL stop would skip policy steps: here every planned step is computed.
+    config = replace(config, ppo=replace(config.ppo, target_kl=1e6))
+    ppo, nets = config.ppo, trainer.networks_of(config.ppo, env.action_size)
+    state = jax.jit(partial(trainer.init, config))(env, jax.random.key(0))
+    key = jax.random.key(1)
+    keys = trainer._step_keys(ppo, key)
+    policy, value = state.learner.policy.params, state.learner.value.params
+
+    @jax.jit
+    def collect(env, actors):
+        return rollout.collect(env, nets, policy, state.obs_stats, actors, keys)
+
+    @jax.jit
+    def prepare(window):
+        carry = state.actors.value_carry
+        return judge(ppo, nets, value, carry, state.obs_stats, state.value_stats, window).batch
+
+    @jax.jit
+    def learn_once(learner, batch):
+        rates = jnp.float32(ppo.policy_lr), jnp.float32(ppo.value_lr)
+        return learn(ppo, nets, rates, learner, batch, key)
+
+    steps = config.steps_per_iteration
+    rollout_s = median_s(lambda: jax.block_until_ready(collect(env, state.actors)))
+    batch = prepare(collect(env, state.actors)[1])
+    learn_s = median_s(lambda: jax.block_until_ready(learn_once(state.learner, batch)))
+    iterate = jax.jit(partial(trainer.train_iteration, config))
+    iteration_s = median_s(lambda: jax.block_until_ready(iterate(env, state)))
+    flops = steps * ppo.epochs * learner_flops(env.obs_size, ppo.hidden, (env.action_size, 1))
+    return TrainingSpeed(
+        rollout_steps_per_s=steps / rollout_s,
+        training_steps_per_s=steps / iteration_s,
+        learner_us_per_step=1e6 * learn_s / steps,
+        learner_gflops=1e-9 * flops / learn_s,
+    )
+
+
+def learner_flops(inputs: int, hidden: int, outputs: tuple[int, ...]) -> int:
+    """Floating-point operations of the matrix products of one gradient of networks with these
+    outputs, for one step: forward, by the weights, and by the inputs of all layers but the first.
+    """
+    total = 0
+    for head in outputs:
+        first = inputs * hidden
+        rest = hidden * hidden + 2 * hidden * 4 * hidden + hidden * head
+        total += 2 * (2 * first + 3 * rest)
+    return total
+
+
+def matmul_gflops() -> float:
+    """The machine's own rate in float32, 1e9/s: the best of a square product and of the network's
+    shape."""
+    return max(_matmul_gflops(n, k, m) for n, k, m in ((1024, 1024, 1024), (2048, 256, 512)))
+
+
+def _matmul_gflops(rows: int, inner: int, columns: int) -> float:
+    a = jax.random.normal(jax.random.key(0), (rows, inner))
+    b = jax.random.normal(jax.random.key(1), (inner, columns))
+    product: Any = jax.jit(jnp.matmul)
+    seconds = median_s(lambda: jax.block_until_ready(product(a, b)))
+    return 2e-9 * rows * inner * columns / seconds
