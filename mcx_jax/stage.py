@@ -6,7 +6,7 @@ step (2048 environments): 7,632 flops without walls, 2,840 with five; 4.6 M agai
 `lax.optimization_barrier` does not help: XLA's CPU pipeline removes it before fusion.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -19,31 +19,44 @@ def stage(wall: jax.Array | None, f: Callable[..., Any], *args: Any) -> Any:
 
     It is the branch of a conditional whose predicate is true but known at run time only: a wall
     that the compiler cannot remove. The cost is one call, 0.1 us, for all environments together.
+    Python floats, in the arguments and in the result, are constants of the model and stay so.
 
     Args:
         wall: () bool, true, UNBATCHED (a leaf of the environment, not of its state), or None for no
             wall (then XLA fuses freely: right on a GPU).
-        f: pure; its result may hold Python floats (constants of the model), which stay constants.
-        args: pytrees of JAX scalars (Python floats among them become arrays).
+        f: pure.
+        args: pytrees of JAX scalars and Python floats.
     """
     if wall is None:
         return f(*args)
-    constants: list[Any] = []
+    given, join_args = split_floats(args)
+    join_result: Any = None
     shapes: list[Any] = []
 
-    def taken(operands):
-        leaves, tree = jax.tree.flatten(f(*operands))
-        traced = [x for x in leaves if not isinstance(x, float)]
-        constants[:] = [tree, [x if isinstance(x, float) else None for x in leaves]]
+    def taken(given):
+        nonlocal join_result
+        traced, join_result = split_floats(f(*join_args(given)))
         shapes[:] = [(jnp.shape(x), jnp.result_type(x)) for x in traced]
         return traced
 
     def never(_):
         return [jnp.zeros(shape, dtype) for shape, dtype in shapes]
 
-    traced = iter(lax.cond(wall, taken, never, args))
-    tree, leaves = constants
-    return jax.tree.unflatten(tree, [next(traced) if x is None else x for x in leaves])
+    traced = lax.cond(wall, taken, never, given)
+    return join_result(traced)
+
+
+def split_floats(tree: Any) -> tuple[list[Any], Callable[[Sequence[Any]], Any]]:
+    """(leaves that are not Python floats, function that puts such leaves back in their places)."""
+    leaves, structure = jax.tree.flatten(tree)
+    constant = [isinstance(x, float) for x in leaves]
+
+    def join(traced: Sequence[Any]) -> Any:
+        rest = iter(traced)
+        filled = [x if c else next(rest) for x, c in zip(leaves, constant, strict=True)]
+        return jax.tree.unflatten(structure, filled)
+
+    return [x for x, c in zip(leaves, constant, strict=True) if not c], join
 
 
 def opaque_true(x: jax.Array) -> jax.Array:

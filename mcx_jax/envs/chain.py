@@ -1,9 +1,6 @@
-"""Forward dynamics of a serial hinge arm on a moving base, as unrolled scalar expressions.
+"""The chain engine: a serial hinge arm, its servos and MuJoCo's integrators.
 
-Recursive Newton-Euler for the bias forces, composite rigid bodies for the mass matrix, L^T D L for
-the solve (Featherstone, Rigid Body Dynamics Algorithms, 2008, ch. 5-6), in link frames. The base's
-motion is prescribed: the recursion starts from its angular velocity, angular acceleration and
-acceleration, so an accelerating deck is exact and costs nothing.
+The dynamics are `envs.dynamics`, their reverse mode is `envs.adjoint`.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,175 +10,11 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from mcx_jax.envs.model import Actuator, ChainModel, Link
-from mcx_jax.spatial import (
-    Mat,
-    Scalar,
-    Vec,
-    add,
-    cross,
-    matmul,
-    matvec,
-    mul,
-    rotate_z,
-    sincos,
-    sub,
-    tmatvec,
-    total,
-    transpose,
-    vadd,
-    vscale,
-)
+from mcx_jax.envs.adjoint import inverse_dynamics_gradient
+from mcx_jax.envs.dynamics import BaseState, bias_forces, factor, joint_sincos, mass_matrix, solve
+from mcx_jax.envs.model import Actuator, ChainModel
+from mcx_jax.spatial import Scalar, add, mul, sub, total
 from mcx_jax.stage import stage
-
-BaseState = tuple[Vec, Vec, Vec]
-"""(w, al, a) of the base in base axes B: angular velocity rad/s, angular acceleration rad/s2, and
-acceleration of the base origin minus gravity, m/s2 (at rest and level: 0, 0, +9.81)."""
-
-
-def joint_sincos(model: ChainModel, q: Sequence[Scalar]) -> list[tuple[Scalar, Scalar]]:
-    """(sin, cos) of every joint angle (rad) counted from the model's reference."""
-    return [sincos(angle - link.q_ref) for link, angle in zip(model.links, q, strict=True)]
-
-
-def link_rotations(model: ChainModel, angles: Sequence[tuple[Scalar, Scalar]]) -> list[Mat]:
-    """Orientation of every link in its parent, from `joint_sincos`."""
-    return [rotate_z(link.rotation, c, s) for link, (s, c) in zip(model.links, angles, strict=True)]
-
-
-def bias_forces(
-    model: ChainModel, angles: Sequence[tuple], qd: Sequence[Scalar], base: BaseState
-) -> list[Scalar]:
-    """Joint torques that hold all joint accelerations at zero, N m (recursive Newton-Euler)."""
-    w, al, a = base
-    rotations = link_rotations(model, angles)
-    wrenches = []
-    for link, r, rate in zip(model.links, rotations, qd, strict=True):
-        a = tmatvec(r, vadd(a, _offset_acceleration(w, al, link.position)))
-        w_parent = tmatvec(r, w)
-        # The hinge is the link's z axis: w x (z qd) = (w_y qd, -w_x qd, 0).
-        al = vadd(tmatvec(r, al), (mul(w_parent[1], rate), -mul(w_parent[0], rate), 0.0))
-        w = vadd(w_parent, (0.0, 0.0, rate))
-        wrenches.append(_inertial_wrench(link, w, al, a))
-    return _project(model, rotations, wrenches)
-
-
-def _offset_acceleration(w: Vec, al: Vec, p: Vec) -> Vec:
-    """al x p + w x (w x p): acceleration of a point p fixed in a rotating frame."""
-    return vadd(cross(al, p), cross(w, cross(w, p)))
-
-
-def _inertial_wrench(link: Link, w: Vec, al: Vec, a: Vec) -> tuple[Vec, Vec]:
-    """Force and moment about the link origin that the link's motion needs."""
-    force = vadd(vscale(link.mass, a), _offset_acceleration(w, al, link.moment))
-    moment = vadd(
-        vadd(_apply_inertia(link.inertia, al), cross(w, _apply_inertia(link.inertia, w))),
-        cross(link.moment, a),
-    )
-    return force, moment
-
-
-def _apply_inertia(inertia: Sequence[Scalar], v: Vec) -> Vec:
-    xx, yy, zz, xy, xz, yz = inertia
-    return matvec(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)), v)
-
-
-def _project(model: ChainModel, rotations: list[Mat], wrenches: list) -> list[Scalar]:
-    """Sum the wrenches from tip to base; the torque of a joint is the moment about its z axis."""
-    torques: list[Scalar] = [0.0] * model.nq
-    force, moment = wrenches[-1]
-    for i in reversed(range(model.nq)):
-        torques[i] = moment[2]
-        if i:
-            force_up = matvec(rotations[i], force)
-            moment_up = vadd(matvec(rotations[i], moment), cross(model.links[i].position, force_up))
-            force = vadd(wrenches[i - 1][0], force_up)
-            moment = vadd(wrenches[i - 1][1], moment_up)
-    return torques
-
-
-def mass_matrix(model: ChainModel, angles: Sequence[tuple]) -> list[list[Scalar]]:
-    """Lower triangle of the joint-space mass matrix, kg m2 (composite rigid bodies)."""
-    n = model.nq
-    rotations = link_rotations(model, angles)
-    mass_rows: list[list[Scalar]] = [[0.0] * (i + 1) for i in range(n)]
-    composite = None
-    for i in reversed(range(n)):
-        link = model.links[i]
-        composite = _merge(link, composite)
-        _, (hx, hy, _), (_, _, izz, _, ixz, iyz) = composite
-        mass_rows[i][i] = add(izz, link.armature)
-        force: Vec = (-hy, hx, 0.0)  # of a unit acceleration about z: z x h
-        moment: Vec = (ixz, iyz, izz)
-        for j in range(i, 0, -1):
-            force = matvec(rotations[j], force)
-            moment = vadd(matvec(rotations[j], moment), cross(model.links[j].position, force))
-            mass_rows[i][j - 1] = moment[2]
-        if i:
-            composite = _to_parent(composite, rotations[i], link.position)
-    return mass_rows
-
-
-def _merge(link: Link, outer):
-    """Mass properties of a link plus those of everything beyond it, in the link's frame."""
-    if outer is None:
-        return link.mass, link.moment, link.inertia
-    mass, moment, inertia = outer
-    summed = tuple(add(x, y) for x, y in zip(link.inertia, inertia, strict=True))
-    return add(link.mass, mass), vadd(link.moment, moment), summed
-
-
-def _to_parent(body, r: Mat, p: Vec):
-    """Mass properties expressed in the parent frame, about the parent's origin."""
-    mass, moment, (xx, yy, zz, xy, xz, yz) = body
-    half = matmul(r, ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
-    rotated = matmul(half, transpose(r))
-    h = matvec(r, moment)
-    # Parallel axes: 2 (p.h) 1 - (p h^T + h p^T) + m (p.p 1 - p p^T), with g = h + m p / 2.
-    g = vadd(h, vscale(0.5, vscale(mass, p)))
-    pg = [[mul(p[i], g[j]) for j in range(3)] for i in range(3)]
-    trace2 = mul(2.0, total([pg[0][0], pg[1][1], pg[2][2]]))
-
-    def shifted(i: int, j: int) -> Scalar:
-        diagonal = trace2 if i == j else 0.0
-        return add(rotated[i][j], sub(diagonal, add(pg[i][j], pg[j][i])))
-
-    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    return mass, vadd(h, vscale(mass, p)), tuple(shifted(i, j) for i, j in pairs)
-
-
-def factor(rows: list[list[Scalar]]) -> tuple[list[list[Scalar]], list[Scalar]]:
-    """L^T D L factors of a symmetric positive matrix given by its lower triangle.
-
-    Returns:
-        (L, 1/D): unit lower rows without the diagonal, and the inverse diagonal.
-    """
-    n = len(rows)
-    a = [list(row) for row in rows]
-    inverse: list[Scalar] = [0.0] * n
-    for k in reversed(range(n)):
-        inverse[k] = 1.0 / a[k][k]
-        for i in reversed(range(k)):
-            scaled = mul(a[k][i], inverse[k])
-            for j in range(i + 1):
-                a[i][j] = sub(a[i][j], mul(scaled, a[k][j]))
-            a[k][i] = scaled
-    return [row[:-1] for row in a], inverse
-
-
-def solve(factors: tuple[list[list[Scalar]], list[Scalar]], b: Sequence[Scalar]) -> list[Scalar]:
-    """x of L^T D L x = b."""
-    lower, inverse = factors
-    n = len(b)
-    x = list(b)
-    for k in reversed(range(n)):
-        for i in range(k):
-            x[i] = sub(x[i], mul(lower[k][i], x[k]))
-    x = [mul(v, d) for v, d in zip(x, inverse, strict=True)]
-    for k in range(n):
-        for i in range(k):
-            x[k] = sub(x[k], mul(lower[k][i], x[i]))
-    return x
 
 
 def actuate(
@@ -222,40 +55,71 @@ def _actuator_force(act: Actuator, q: Scalar, qd: Scalar, ctrl: Scalar) -> tuple
     return jnp.clip(force, low, high), slope
 
 
+Motors = tuple[tuple, tuple, tuple]
+"""(q rad, qd rad/s, ctrl), one scalar a joint or actuator."""
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def joint_accelerations(
-    model: ChainModel,
-    integrator: str,
-    q: Sequence[Scalar],
-    qd: Sequence[Scalar],
-    ctrl: Sequence[Scalar],
-    base: BaseState,
-    wall: jax.Array | None = None,
-) -> list[Scalar]:
+    model: ChainModel, integrator: str, motors: Motors, base: BaseState, wall: jax.Array | None
+) -> tuple[Scalar, ...]:
     """The acceleration that MuJoCo's integrator multiplies by the time step, rad/s2.
 
     euler: M + h D with the joints' own damping D; implicitfast: the actuators' velocity derivative
     as well (for a model without damping, euler's is the forward dynamics). straight-through: the
     value of euler, the derivative of implicitfast (the servo chatters under euler: its derivative
     is true and useless).
+
+    The reverse mode is the implicit function theorem's: with (M + h D) qdd + bias = torque and a
+    cotangent g of qdd, the cotangents are those of mu . (torque - (M + h D) qdd - bias) for
+    mu = (M + h D)^-1 g: one more solve and one reverse sweep of the inverse dynamics, neither the
+    mass matrix nor its factors are differentiated (compare Carpentier & Mansard, RSS 2018).
     """
-    angles = stage(wall, partial(joint_sincos, model), list(q))
-    bias = stage(wall, partial(bias_forces, model), angles, list(qd), base)
+    return _accelerations(model, integrator, motors, base, wall)[0]
+
+
+def _accelerations(model: ChainModel, integrator: str, motors: Motors, base: BaseState, wall):
+    """(value, (smooth acceleration, factors, angles)): the latter are what the gradient needs."""
+    q, qd, ctrl = motors
+    angles = stage(wall, partial(joint_sincos, model), q)
+    bias = stage(wall, partial(bias_forces, model), angles, qd, base)
     matrix = stage(wall, partial(mass_matrix, model), angles)
     torque, slopes = actuate(model, q, qd, ctrl)
     rhs = [sub(t, b) for t, b in zip(torque, bias, strict=True)]
+
+    def accelerations(damping):
+        factors = stage(wall, factor, _stiffened(matrix, damping, model.timestep_s))
+        return tuple(stage(wall, solve, factors, rhs)), factors
+
     passive = [link.damping for link in model.links]
+    value, factors = accelerations(passive if integrator == "euler" else slopes)
+    kept = value, factors, angles
+    if integrator == "straight-through":
+        value = accelerations(passive)[0]
+    return value, kept
 
-    def accelerations(implicit):
-        factors = stage(wall, factor, _stiffened(matrix, implicit, model.timestep_s))
-        return stage(wall, solve, factors, rhs)
 
-    if integrator == "euler":
-        return accelerations(passive)
-    smooth = accelerations(slopes)
-    if integrator == "implicitfast":
-        return smooth
-    rough = lax.stop_gradient(accelerations(passive))
-    return [x + (r - lax.stop_gradient(x)) for x, r in zip(smooth, rough, strict=True)]
+def _accelerations_forward(model, integrator, motors, base, wall):
+    value, kept = _accelerations(model, integrator, motors, base, wall)
+    return value, (motors, base, wall, kept)
+
+
+def _accelerations_backward(model, integrator, saved, cotangent):
+    motors, base, wall, (accelerations, factors, angles) = saved
+    q, qd, ctrl = motors
+    mu = stage(wall, solve, factors, cotangent)
+    d_q, d_qd, d_base = inverse_dynamics_gradient(model, wall, angles, qd, accelerations, base, mu)
+    _, pull = jax.vjp(lambda *motors: actuate(model, *motors)[0], q, qd, ctrl)
+    by_torque = pull(list(mu))
+    d_motors = (_minus(by_torque[0], d_q), _minus(by_torque[1], d_qd), by_torque[2])
+    return d_motors, jax.tree.map(lambda x: -x, d_base), None
+
+
+def _minus(a: Sequence[Scalar], b: Sequence[Scalar]) -> tuple[Scalar, ...]:
+    return tuple(sub(x, y) for x, y in zip(a, b, strict=True))
+
+
+joint_accelerations.defvjp(_accelerations_forward, _accelerations_backward)
 
 
 def _stiffened(matrix: list[list[Scalar]], slopes: Sequence[Scalar], h_s: float):
@@ -277,7 +141,8 @@ def substep(
 ) -> tuple[list[Scalar], list[Scalar]]:
     """One physics step, semi-implicit as MuJoCo: new velocities, then positions with them."""
     h = model.timestep_s
-    qdd = joint_accelerations(model, integrator, q, qd, ctrl, base, wall)
+    motors = (tuple(q), tuple(qd), tuple(ctrl))
+    qdd = joint_accelerations(model, integrator, motors, base, wall)
     qd = [v + h * a for v, a in zip(qd, qdd, strict=True)]
     return [x + h * v for x, v in zip(q, qd, strict=True)], qd
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import lax
 
-from mcx_jax.envs import chain
+from mcx_jax.envs import dynamics
 from mcx_jax.envs.model import ChainModel
 from mcx_jax.spatial import (
     EYE,
@@ -70,7 +70,7 @@ def tool_pose(
     model: ChainModel, q: Sequence[Scalar], wall: jax.Array | None = None
 ) -> tuple[Mat, Vec]:
     """(R_B_E, p_B_E) of the tool site at joint angles q (rad), metres."""
-    angles = stage(wall, partial(chain.joint_sincos, model), list(q))
+    angles = stage(wall, partial(dynamics.joint_sincos, model), list(q))
     r, p, _, _ = stage(wall, partial(_kinematics, model), angles)
     return r, p
 
@@ -79,7 +79,7 @@ def _kinematics(model: ChainModel, angles) -> tuple[Mat, Vec, list[Vec], list[Ve
     """Tool pose, and each hinge's axis and anchor, in B."""
     r, p = EYE, ZERO
     axes, anchors = [], []
-    for link, rotation in zip(model.links, chain.link_rotations(model, angles), strict=True):
+    for link, rotation in zip(model.links, dynamics.link_rotations(model, angles), strict=True):
         p = vadd(p, matvec(r, link.position))
         r = matmul(r, rotation)
         axes.append((r[0][2], r[1][2], r[2][2]))
@@ -97,7 +97,7 @@ def _newton(
     which is zero at the solution: the implicit function theorem).
     """
     frozen = tuple(lax.stop_gradient(x) for x in q)
-    angles = stage(wall, partial(chain.joint_sincos, model), frozen)
+    angles = stage(wall, partial(dynamics.joint_sincos, model), frozen)
     r, p, axes, anchors = stage(wall, partial(_kinematics, model), angles)
     e = stage(wall, _pose_error, (r, p), target)
     error = norm(e[:3]) + norm(e[3:])
@@ -131,8 +131,8 @@ def _normal_matrix(columns: list[tuple], damping: Scalar) -> list[list[Scalar]]:
 
 def _least_squares(wall, columns: list[tuple], gram, e: tuple) -> list[Scalar]:
     """J^T (J J^T + damping 1)^-1 e."""
-    factors = stage(wall, chain.factor, gram)
-    multipliers = stage(wall, chain.solve, factors, list(e))
+    factors = stage(wall, dynamics.factor, gram)
+    multipliers = stage(wall, dynamics.solve, factors, list(e))
     return [dot(col, multipliers) for col in columns]  # type: ignore[arg-type]
 
 

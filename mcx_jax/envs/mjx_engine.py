@@ -14,7 +14,7 @@ import mujoco
 from jax import lax
 from mujoco import mjx
 
-from mcx_jax.envs.chain import BaseState
+from mcx_jax.envs.dynamics import BaseState
 
 INTEGRATORS = {
     "euler": mujoco.mjtIntegrator.mjINT_EULER,
