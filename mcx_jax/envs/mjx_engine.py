@@ -11,6 +11,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from jax import lax
 from mujoco import mjx
 
@@ -29,7 +30,52 @@ def put_model(mj: mujoco.MjModel, integrator: str) -> mjx.Model:
     mj.opt.integrator = INTEGRATORS[integrator]
     mj.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     mj.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+    # `servo` limits the commands: MJX gets them counted from the joint angle.
+    if mj.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
+        mj.actuator_ctrllimited[:] = False
+    mj.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
     return mjx.put_model(mj)
+
+
+def servo(
+    m: mjx.Model, q: jax.Array, qd: jax.Array, ctrl: jax.Array
+) -> tuple[mjx.Model, jax.Array]:
+    """The same actuators written so that MJX's own formula gives C's force and derivative.
+
+    MJX forms gain * ctrl + bias . (1, length, velocity). Two things are mended, by value:
+    1. A position servo (bias[1] = -gain) of kp 1e5 subtracts two float32 products of 3e5 N m, 1e-4
+       rad/s of noise a step. Its command is counted from the joint angle instead: ctrl - length
+       with bias[1] = 0, so one product of the small difference.
+    2. implicitfast in C leaves out the velocity derivative of a force at its limit, MJX keeps it.
+       At the limit the actuator becomes a constant: bias = (limit, 0, 0), command 0.
+
+    Args:
+        q: (nq,) joint angles, rad.
+        qd: (nq,) joint velocities, rad/s.
+        ctrl: (nu,) commands.
+
+    Returns:
+        (model, commands) for `mjx.step`; control limits are applied here.
+    """
+    joint, gear = m.actuator_trnid[:, 0], m.actuator_gear[:, 0]
+    length, velocity = gear * q[joint], gear * qd[joint]
+    affine = m.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE
+    gain, bias = m.actuator_gainprm[:, 0], jnp.where(affine[:, None], m.actuator_biasprm, 0.0)
+    command = _clip(ctrl, m.actuator_ctrllimited, m.actuator_ctrlrange)
+    from_length = affine & (bias[:, 1] == -gain)
+    command = jnp.where(from_length, command - length, command)
+    bias = bias.at[:, 1].set(jnp.where(from_length, 0.0, bias[:, 1]))
+    force = gain * command + bias[:, 0] + bias[:, 1] * length + bias[:, 2] * velocity
+    limit = _clip(force, m.actuator_forcelimited, m.actuator_forcerange)
+    at_limit = affine & (force != limit)  # a motor has no bias to be rewritten and no derivative
+    constant = jnp.zeros_like(bias).at[:, 0].set(limit)
+    bias = jnp.where(at_limit[:, None], constant, bias)
+    return m.replace(actuator_biasprm=bias), jnp.where(at_limit, 0.0, command)
+
+
+def _clip(x: jax.Array, limited: np.ndarray, bounds: jax.Array) -> jax.Array:
+    low, high = jnp.where(limited[:, None], bounds, jnp.array([-jnp.inf, jnp.inf])).T
+    return jnp.clip(x, low, high)
 
 
 def inertial_wrenches(m: mjx.Model, d: mjx.Data, base: BaseState) -> jax.Array:
@@ -68,9 +114,10 @@ def substeps(
     blank = mjx.make_data(m)
 
     def body(i, state):
-        d = blank.replace(qpos=state[0], qvel=state[1], ctrl=ctrl)
+        actuated, commands = servo(m, *state, ctrl)
+        d = blank.replace(qpos=state[0], qvel=state[1], ctrl=commands)
         d = mjx.com_vel(m, mjx.com_pos(m, mjx.kinematics(m, d)))
-        d = mjx.step(m, d.replace(xfrc_applied=inertial_wrenches(m, d, base_at(i))))
+        d = mjx.step(actuated, d.replace(xfrc_applied=inertial_wrenches(m, d, base_at(i))))
         return d.qpos, d.qvel
 
     return lax.fori_loop(0, count, body, (q, qd))
