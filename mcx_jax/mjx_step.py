@@ -75,9 +75,7 @@ def step(m: mjx.Model, d: mjx.Data) -> mjx.Data:
         sub(mul(-k, x - rest), mul(c, v))
         for (k, rest), c, x, v in zip(arm.springs, dampings, q, qd, strict=True)
     ]
-    applied = [
-        d.qfrc_applied[i] + x for i, x in enumerate(_cartesian(arm, angles, d.xfrc_applied))
-    ]
+    applied = [d.qfrc_applied[i] + x for i, x in enumerate(_cartesian(arm, angles, d.xfrc_applied))]
     smooth = [total([-b, *x]) for b, *x in zip(bias, passive, actuation, applied, strict=True)]
     matrix = chain.mass_matrix(arm.model, angles)
     qacc = chain.solve(chain.factor(matrix), smooth)

@@ -128,8 +128,9 @@ def states(mj: mujoco.MjModel, count: int, seed: int) -> tuple[np.ndarray, ...]:
     # Every second row near the joint, so that about half of the actuators are within their limits.
     reach = np.where(np.arange(count)[:, None] % 2, 0.1, 2.0)
     joints = mj.actuator_trnid[:, 0]
-    lengths = mj.actuator_gear[:, 0] * q[:, joints]
-    return q, qd, lengths + reach * rng.uniform(-1.0, 1.0, (count, mj.nu))
+    length = mj.actuator_gear[:, 0] * q[:, joints]
+    target = np.where(mj.actuator_biasprm[:, 1] != 0.0, length, 0.0)
+    return q, qd, target + reach * rng.uniform(-1.0, 1.0, (count, mj.nu))
 
 
 def c_step(mj: mujoco.MjModel, q, qd, ctrl, d: mujoco.MjData | None = None) -> mujoco.MjData:

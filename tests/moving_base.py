@@ -1,5 +1,7 @@
 """C MuJoCo in float64 as the reference for an arm on a base whose motion is prescribed."""
 
+import functools
+
 import mujoco
 import numpy as np
 
@@ -19,7 +21,14 @@ def free_base_model(arm: str | mujoco.MjModel) -> mujoco.MjModel:
         mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
     )
     spec.option.timestep = child.option.timestep
+    spec.option.integrator = child.option.integrator  # not used: attaching warns if they differ
     return spec.compile()
+
+
+@functools.cache
+def scratch(m: mujoco.MjModel) -> mujoco.MjData:
+    """One scratch for every model: allocation takes ten times as long as a step."""
+    return mujoco.MjData(m)
 
 
 def arm_path(name: str) -> str:
@@ -50,7 +59,7 @@ def acceleration(
 
     Solves the arm's rows of M qacc + bias = tau for the arm, with the base's qacc given.
     """
-    d = mujoco.MjData(m)
+    d = scratch(m)
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, np.ascontiguousarray(rotation).ravel())
     d.qpos[3:7], d.qpos[7:] = quat, q
@@ -64,4 +73,4 @@ def acceleration(
     return np.linalg.solve(full[6:, 6:] + np.diag(np.broadcast_to(implicit, len(q))), rhs)
 
 
-__all__ = ["acceleration", "arm_path", "free_base_model", "load_mujoco"]
+__all__ = ["acceleration", "arm_path", "free_base_model", "load_mujoco", "scratch"]

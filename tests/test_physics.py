@@ -1,128 +1,342 @@
-"""Both physics engines against C MuJoCo: random states, moving base, saturated servo."""
+"""Both physics engines against C MuJoCo in float64, at three levels, on a moving base.
 
+1. One step from random states: joints over the whole range, to 2 rad/s, servos within and at their
+   force limits. 2. One step from every state of a C trajectory of 1 s. 3. That second in one go.
+`paper` runs with Euler (its servo chatters), `ur10e` with implicitfast.
+"""
+
+import functools
+
+import arms
 import jax
 import jax.numpy as jnp
 import moving_base
 import mujoco
 import numpy as np
 import pytest
+from jax import lax
 from scipy.spatial.transform import Rotation
 
 from mcx_jax.envs import chain, mjx_engine
 from mcx_jax.envs.model import chain_model, load_mujoco
+from mcx_jax.envs.v2v import START_POSE_RAD
 from mcx_jax.errors import UserError
+from mcx_jax.spatial import unpack
 
 H_S = 0.002
-# Tolerances of one step's joint velocity, rad/s.
-# float64: both solve the same equations; the mass matrix's condition (1e3) times 1e-16 times
-# torque/inertia of up to 1e3 rad/s2 leaves 1e-12; 1e-9 is what the project promises.
-TOLERANCE_F64 = 1e-9
-# float32: kp (q_ref - q) alone carries 1e5 * 2e-7 rad = 0.02 N m of rounding, over inertias of
-# 1 kg m2 and one step of 2 ms: 4e-5 rad/s.
-# MJX forms kp q_ref - kp q from two rounded products of 3e5 N m: three times as much.
-TOLERANCE_F32 = {"chain": 1e-4, "mjx": 3e-4}
-STILL = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 9.81))
+ROWS, CHUNK, CHUNKS = 16, 50, 10
+ARMS = {"euler": "paper", "implicitfast": "ur10e"}
+ENGINES = [(engine, integrator) for integrator in ARMS for engine in ("chain", "mjx")]
+
+TOLERANCE = {
+    # Joint velocity after one step, rad/s. Same equations in float64: the mass matrix's condition
+    # (1e3) times 1e-16 times torque/inertia of up to 1e3 rad/s2 leaves 1e-12; promised is 1e-9.
+    "step, float64": 1e-9,
+    # Angle and command of 3 rad rounded at 1.2e-7 each, kp 1e5: 0.024 N m over 1 kg m2 in 2 ms. Not
+    # asked at random states: near a singular wrist the rounding alone moves C itself by 1e-3.
+    "step, float32": 1e-4,
+    # C from the rounded state: what is left is the arithmetic of torques of 300 N m.
+    "step, float32, rounded C": 2e-5,
+    # The same where the mass matrix's condition is above 500 (wrist 2 within 0.1 rad of straight,
+    # an inertia of 0.03 kg m2 as the difference of two of 1): that many roundings of 1e-7 of 5 rad/s.
+    "step, float32, rounded C, singular": 2e-4,
+    # Tool after 1 s, m. float64: the step's 1e-12 times 500 steps, not amplified.
+    "second, float64": 1e-9,
+    # float32 against C whose state is rounded after every step: the servo (kp 1e5) holds the joints
+    # to some roundings of 2e-7 rad, the arm is 1 m long.
+    "second, float32, rounded C": 2e-5,
+    # Under Euler the servo's chatter is chaotic: mean sizes over rows and time, relative.
+    "second, chatter": 0.1,
+    # Derivative of ten steps, relative to the largest: differences with h = 1e-6 carry rounding of
+    # 1e-15 / h and truncation of h^2 times a third derivative of 1e3.
+    "gradient, differences": 1e-6,
+    "gradient, engines": 1e-9,
+}
 
 
-def random_state(rng, *, near_target: bool):
-    """Every joint drawn separately; the servo either within or far beyond its force limits."""
-    q, qd = rng.uniform(-np.pi, np.pi, 6), rng.uniform(-2.0, 2.0, 6)
-    reach = 3e-4 if near_target else 0.3
-    ctrl = np.concatenate([q + rng.uniform(-reach, reach, 6), qd + rng.uniform(-0.02, 0.02, 6)])
-    return q, qd, ctrl
+def random_states(count: int, seed: int) -> tuple[np.ndarray, ...]:
+    """(count, 6) rad, (count, 6) rad/s, (count, 1, 12) commands, (count, 1, 9) base motions.
+
+    Every joint drawn separately; odd rows far beyond the limits of position and velocity servos.
+    """
+    rng = np.random.default_rng(seed)
+    q, qd = rng.uniform(-np.pi, np.pi, (count, 6)), rng.uniform(-2.0, 2.0, (count, 6))
+    far = np.arange(count)[:, None] % 2
+    positions = q + np.where(far, 0.3, 3e-4) * rng.uniform(-1.0, 1.0, (count, 6))
+    velocities = qd + np.where(far, 1.0, 0.02) * rng.uniform(-1.0, 1.0, (count, 6))
+    base = rng.uniform(-1.0, 1.0, (count, 9)) * np.repeat([1.0, 3.0, 3.0], 3)
+    base[:, 8] += 9.81
+    return q, qd, np.concatenate([positions, velocities], axis=1)[:, None], base[:, None]
 
 
-def c_step(mj, q, qd, ctrl):
-    d = mujoco.MjData(mj)
-    d.qpos[:], d.qvel[:], d.ctrl[:] = q, qd, ctrl
-    mujoco.mj_step(mj, d)
-    return d.qpos.copy(), d.qvel.copy()
+def smooth_motion(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """(ROWS, T, 12) commands and (ROWS, T, 9) base motions of 1 s: a deck in waves, the arm
+    following with up to 0.5 rad/s."""
+    rng = np.random.default_rng(seed)
+    t = H_S * np.arange(CHUNK * CHUNKS)[:, None]
+
+    def waves(size, offset):
+        w = rng.uniform(2.0, 5.0, (ROWS, 1, len(size)))
+        phase = w * t + rng.uniform(0.0, 6.0, w.shape)
+        return offset + size * np.sin(phase), size * w * np.cos(phase)
+
+    angles, rates = waves(np.full(6, 0.1), np.array(START_POSE_RAD))
+    base, _ = waves(np.repeat([0.3, 0.5, 1.0], 3), np.array([0.0] * 8 + [9.81]))
+    return np.concatenate([angles, rates], axis=2), base
 
 
-def engine_step(engine: str, mj, integrator: str):
-    model = chain_model(mj, "tool")
+@functools.cache
+def compiled(engine: str, integrator: str, dtype: str):
+    """`count` steps of a batch: (q, qd, commands (B, T, 12), base (B, T, 9), count) -> (q, qd)."""
+    mj = load_mujoco(ARMS[integrator])
     if engine == "chain":
-
-        def step(q, qd, ctrl, base):
-            return chain.substeps(model, integrator, q, qd, ctrl, lambda i: base, 1)
+        advance = functools.partial(chain.substeps, chain_model(mj), integrator)
     else:
-        device = mjx_engine.put_model(mj, integrator)
+        advance = functools.partial(mjx_engine.substeps, mjx_engine.put_model(mj, integrator))
 
-        def step(q, qd, ctrl, base):
-            return mjx_engine.substeps(device, q, qd, ctrl, lambda i: base, 1)
+    def run(q, qd, ctrl, base, count):
+        def body(i, state):
+            motion = base[i]
+            split = tuple(unpack(motion[k : k + 3], 3) for k in (0, 3, 6))
+            return advance(*state, ctrl[i], lambda _: split, 1)
 
-    return jax.jit(step)
+        return lax.fori_loop(0, count, body, (q, qd))
+
+    options = {} if (engine, dtype) == ("chain", "float32") else arms.QUICK
+    return jax.jit(jax.vmap(run, in_axes=(0, 0, 0, 0, None)), compiler_options=options)
+
+
+def engine_steps(engine: str, integrator: str, dtype: str, q, qd, ctrl, base, count=1):
+    """The engine's (q, qd) after `count` <= CHUNK steps of ROWS rows, float64 NumPy."""
+    pad = CHUNK - ctrl.shape[1]
+    ctrl, base = (np.pad(x, ((0, 0), (0, pad), (0, 0))) for x in (ctrl, base))
+    with jax.enable_x64(dtype == "float64"):
+        args = [jnp.asarray(np.asarray(x, dtype)) for x in (q, qd, ctrl, base)]
+        result = compiled(engine, integrator, dtype)(*args, count)
+        return tuple(np.asarray(x, np.float64) for x in result)
+
+
+@functools.cache
+def c_models(integrator: str) -> tuple[mujoco.MjModel, mujoco.MjModel]:
+    """The arm fixed to the world, and on a free base."""
+    name = ARMS[integrator]
+    return load_mujoco(name), moving_base.free_base_model(moving_base.arm_path(name))
+
+
+def c_step(integrator: str, q, qd, ctrl, base) -> tuple[np.ndarray, np.ndarray]:
+    """C MuJoCo's (q, qd) of one row after one step; base (9,) as `chain.BaseState`."""
+    fixed, free = c_models(integrator)
+    # Any orientation of the deck gives the same; one that is not level tests more.
+    tilt = Rotation.from_rotvec([0.3, -0.5, 0.8]).as_matrix()
+    w, al, acc = base[:3], base[3:6], tilt @ base[6:] - [0.0, 0.0, 9.81]
+    implicit = np.zeros(6)
+    if integrator == "implicitfast":
+        d = moving_base.scratch(fixed)
+        d.qpos[:], d.qvel[:], d.ctrl[:] = q, qd, ctrl
+        mujoco.mj_fwdPosition(fixed, d)
+        mujoco.mj_fwdVelocity(fixed, d)
+        mujoco.mj_fwdActuation(fixed, d)
+        inside = np.abs(d.actuator_force) < fixed.actuator_forcerange[:, 1]
+        slope = -fixed.actuator_biasprm[:, 2] * inside
+        np.add.at(implicit, fixed.actuator_trnid[:, 0], H_S * slope)
+    qdd = moving_base.acceleration(free, q, qd, ctrl, tilt, w, al, acc, implicit)
+    qd = qd + H_S * qdd
+    return q + H_S * qd, qd
+
+
+def rounded(*arrays):
+    """The nearest float32 numbers, as float64."""
+    return tuple(np.asarray(np.float32(x), np.float64) for x in arrays)
+
+
+@functools.cache
+def c_second(integrator: str, shadow: bool) -> tuple[np.ndarray, np.ndarray]:
+    """(T + 1, ROWS, 6) angles and velocities of 1 s in C; a shadow rounds state and input."""
+    rounding = rounded if shadow else lambda *x: x
+    ctrl, base = rounding(*smooth_motion(4))
+    q, qd = rounding(ctrl[:, 0, :6], ctrl[:, 0, 6:])
+    states = [(q, qd)]
+    for k in range(CHUNK * CHUNKS):
+        rows = [c_step(integrator, q[i], qd[i], ctrl[i, k], base[i, k]) for i in range(ROWS)]
+        q, qd = rounding(*(np.stack(x) for x in zip(*rows, strict=True)))
+        states.append((q, qd))
+    return tuple(np.stack(x) for x in zip(*states, strict=True))  # type: ignore[return-value]
+
+
+def tool(integrator: str, q: np.ndarray) -> np.ndarray:
+    """(..., 3) tool positions in the arm's base by C MuJoCo, m."""
+    mj, _ = c_models(integrator)
+    d = mujoco.MjData(mj)
+    found = []
+    for angles in q.reshape(-1, 6):
+        d.qpos[:] = angles
+        mujoco.mj_kinematics(mj, d)
+        found.append(d.site("tool").xpos.copy())
+    return np.reshape(found, (*q.shape[:-1], 3))
+
+
+def step_errors(engine, integrator, dtype, rows) -> dict[str, float]:
+    """Largest velocity error of one step against C, and C from the rounded state, rad/s."""
+    got = engine_steps(engine, integrator, dtype, *rows)[1]
+
+    def error(q, qd, ctrl, base):
+        rows = zip(q, qd, ctrl[:, 0], base[:, 0], strict=True)
+        return np.abs(got - np.stack([c_step(integrator, *row)[1] for row in rows])).max(1)
+
+    errors = {f"step, {dtype}": error(*rows).max()}
+    if dtype == "float32":
+        singular = condition(integrator, rows[0]) > 500.0
+        arithmetic = error(*rounded(*rows))
+        errors["step, float32, rounded C"] = np.max(arithmetic[~singular])
+        errors["step, float32, rounded C, singular"] = np.max(arithmetic[singular], initial=0.0)
+    return errors
+
+
+def condition(integrator: str, q: np.ndarray) -> np.ndarray:
+    """(rows,) condition number of the mass matrix."""
+    mj, _ = c_models(integrator)
+    d, full = moving_base.scratch(mj), np.zeros((6, 6))
+    found = []
+    for angles in q:
+        d.qpos[:] = angles
+        mujoco.mj_fwdPosition(mj, d)
+        mujoco.mj_fullM(mj, d, full)
+        found.append(np.linalg.cond(full))
+    return np.array(found)
+
+
+def check(errors: dict[str, float]) -> None:
+    for name, error in errors.items():
+        assert error < TOLERANCE[name], f"{name}: {error:.1e}"
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize(("engine", "integrator"), ENGINES)
+def test_one_step_from_random_states(engine, integrator, dtype):
+    states = random_states(4 * ROWS, seed=1)
+    for k in range(4):
+        errors = step_errors(engine, integrator, dtype, [x[k::4] for x in states])
+        errors.pop("step, float32", None)
+        check(errors)
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize(("engine", "integrator"), ENGINES)
+def test_one_step_from_the_states_of_a_trajectory(engine, integrator, dtype):
+    """Of the first row, every state: ROWS at a time."""
+    q, qd = (x[:, 0] for x in c_second(integrator, shadow=False))
+    ctrl, base = (x[0, :, None] for x in smooth_motion(4))
+    for k in range(0, CHUNK * CHUNKS - ROWS + 1, ROWS):
+        rows = slice(k, k + ROWS)
+        check(step_errors(engine, integrator, dtype, (q[rows], qd[rows], ctrl[rows], base[rows])))
+
+
+def engine_second(engine, integrator, dtype) -> tuple[np.ndarray, np.ndarray]:
+    """(CHUNKS, ROWS, 6) angles and velocities every CHUNK steps of the second."""
+    ctrl, base = smooth_motion(4)
+    q, qd = ctrl[:, 0, :6], ctrl[:, 0, 6:]
+    states = []
+    for k in range(CHUNKS):
+        now = slice(k * CHUNK, (k + 1) * CHUNK)
+        q, qd = engine_steps(engine, integrator, dtype, q, qd, ctrl[:, now], base[:, now], CHUNK)
+        states.append((q, qd))
+    return tuple(np.stack(x) for x in zip(*states, strict=True))  # type: ignore[return-value]
 
 
 @pytest.mark.parametrize(
-    ("engine", "integrator", "arm"),
-    [
-        ("chain", "euler", "paper"),
-        ("chain", "implicitfast", "paper"),
-        ("chain", "euler", "ur10e"),
-        ("chain", "implicitfast", "ur10e"),
-        # MJX compiles for 10 s each; each arm with its own integrator.
-        ("mjx", "euler", "paper"),
-        ("mjx", "implicitfast", "ur10e"),
-    ],
+    ("dtype", "level"),
+    [("float64", "second, float64"), ("float32", "second, float32, rounded C")],
 )
-def test_one_step_equals_c(engine, integrator, arm):
-    mj = load_mujoco(arm)
-    mj.opt.integrator = mjx_engine.INTEGRATORS[integrator]
-    rng = np.random.default_rng(1)
-    states = [random_state(rng, near_target=k % 2 == 0) for k in range(24)]
-    with jax.enable_x64(True):
-        step = engine_step(engine, mj, integrator)
-        for q, qd, ctrl in states:
-            got_q, got_qd = step(q, qd, ctrl, STILL)
-            want_q, want_qd = c_step(mj, q, qd, ctrl)
-            np.testing.assert_allclose(got_qd, want_qd, rtol=0, atol=TOLERANCE_F64)
-            np.testing.assert_allclose(got_q, want_q, rtol=0, atol=TOLERANCE_F64)
+@pytest.mark.parametrize("engine", ["chain", "mjx"])
+def test_a_second_under_implicitfast(engine, dtype, level):
+    q, _ = engine_second(engine, "implicitfast", dtype)
+    want, _ = c_second("implicitfast", shadow=dtype == "float32")
+    apart = tool("implicitfast", q) - tool("implicitfast", want[CHUNK::CHUNK])
+    check({level: float(np.linalg.norm(apart, axis=-1).max())})
 
 
 @pytest.mark.parametrize("engine", ["chain", "mjx"])
-def test_one_step_equals_c_in_float32(engine):
-    mj = load_mujoco("paper")
-    rng = np.random.default_rng(2)
-    step = engine_step(engine, mj, "euler")
-    for k in range(24):
-        # C gets the float32-rounded state, so that only the arithmetic differs.
-        state = random_state(rng, near_target=k % 2 == 0)
-        q, qd, ctrl = (np.float32(x) for x in state)
-        got = step(jnp.asarray(q), jnp.asarray(qd), jnp.asarray(ctrl), STILL)[1]
-        want = c_step(mj, q, qd, ctrl)[1]
-        np.testing.assert_allclose(got, want, rtol=0, atol=TOLERANCE_F32[engine])
+def test_statistics_of_a_second_under_euler(engine):
+    """Chatter: what the joints and the tool are off the references, mean over rows and time."""
+    ctrl, _ = smooth_motion(4)
+
+    def sizes(q, qd):
+        reference = ctrl[:, CHUNK - 1 :: CHUNK].swapaxes(0, 1)
+        off = tool("euler", q) - tool("euler", reference[..., :6])
+        return np.array(
+            [np.linalg.norm(off, axis=-1).mean(), *np.abs(qd - reference[..., 6:]).mean((0, 1))]
+        )
+
+    q, qd = c_second("euler", shadow=True)
+    want = sizes(q[CHUNK::CHUNK], qd[CHUNK::CHUNK])
+    got = sizes(*engine_second(engine, "euler", "float32"))
+    check({"second, chatter": float(np.abs(got / want - 1.0).max())})
 
 
-@pytest.mark.parametrize("engine", ["chain", "mjx"])
-def test_moving_base_equals_c_with_prescribed_base(engine):
-    mj = load_mujoco("paper")
-    free = moving_base.free_base_model(moving_base.arm_path("paper"))
-    rng = np.random.default_rng(3)
+def weighted(advance, count: int):
+    """x = (q, qd, ctrl) (24,) -> a weighted sum of (q, qd) after `count` steps of an engine."""
+    weights = np.random.default_rng(6).normal(size=(2, 6))
+    base = ((0.1, -0.2, 0.3), (0.5, 0.3, -0.4), (0.2, 1.0, 9.5))
+
+    def value(x):
+        after = advance(x[:6], x[6:12], x[12:], lambda i: base, count)
+        return jnp.sum(weights * jnp.stack(after))
+
+    return value
+
+
+def test_gradient_of_ten_steps():
+    """The chain engine's reverse mode against central differences and against MJX."""
+    mj = load_mujoco("ur10e")
+    q, qd, ctrl, _ = random_states(1, seed=7)
+    x = np.concatenate([q[0], qd[0], ctrl[0, 0]])
+    ours = weighted(functools.partial(chain.substeps, chain_model(mj), "implicitfast"), 10)
+    device = mjx_engine.put_model(mj, "implicitfast")
+    theirs = weighted(functools.partial(mjx_engine.substeps, device), 10)
+    quick = functools.partial(jax.jit, compiler_options=arms.QUICK)
+    h = 1e-6
     with jax.enable_x64(True):
-        step = engine_step(engine, mj, "euler")
-        for k in range(12):
-            q, qd, ctrl = random_state(rng, near_target=k % 2 == 0)
-            w, al, acc = (rng.uniform(-s, s, 3) for s in (1.0, 3.0, 3.0))
-            rotation = Rotation.random(random_state=k).as_matrix()
-            a = rotation.T @ (acc + [0.0, 0.0, 9.81])
-            got = step(q, qd, ctrl, (tuple(w), tuple(al), tuple(a)))[1]
-            qdd = moving_base.acceleration(free, q, qd, ctrl, rotation, w, al, acc)
-            np.testing.assert_allclose(got, qd + H_S * qdd, rtol=0, atol=TOLERANCE_F64)
+        slope = np.asarray(quick(jax.grad(ours))(x))
+        high, low = np.split(np.asarray(quick(jax.vmap(ours))(x + h * SIGNED_AXES)), 2)
+        mjx_slope = quick(jax.vmap(lambda v: jax.jvp(theirs, (x,), (v,))[1]))(np.eye(24))
+    size = np.abs(slope).max()
+    check({"gradient, differences": np.abs(slope - (high - low) / (2 * h)).max() / size})
+    check({"gradient, engines": np.abs(slope - mjx_slope).max() / size})
+    assert np.all(np.abs(slope).reshape(4, 6).max(1) > 1e-3)
 
 
-def test_saturation_really_occurs_in_the_random_states():
-    mj = load_mujoco("paper")
-    rng = np.random.default_rng(1)
-    saturated = []
-    for k in range(24):
+SIGNED_AXES = np.concatenate([np.eye(24), -np.eye(24)])
+
+
+def test_straight_through_is_eulers_value_and_implicitfasts_derivative():
+    model = chain_model(load_mujoco("paper"))
+    x = np.concatenate([a[0].ravel() for a in random_states(1, seed=8)[:3]])
+
+    def both(x):
+        return {
+            name: jax.value_and_grad(weighted(functools.partial(chain.substeps, model, name), 1))(x)
+            for name in ("euler", "implicitfast", "straight-through")
+        }
+
+    with jax.enable_x64(True):
+        found = jax.tree.map(np.asarray, jax.jit(both, compiler_options=arms.QUICK)(x))
+    value, slope = found["straight-through"]
+    np.testing.assert_allclose(value, found["euler"][0], rtol=1e-12)
+    np.testing.assert_allclose(slope, found["implicitfast"][1], rtol=1e-12, atol=1e-12)
+    assert np.abs(found["euler"][1] - found["implicitfast"][1]).max() > 0.1
+
+
+def test_the_random_states_reach_the_limits_of_both_servos():
+    q, qd, ctrl, _ = random_states(4 * ROWS, seed=1)
+    mj, _ = c_models("euler")
+    at_limit = []
+    for row in zip(q, qd, ctrl[:, 0], strict=True):
         d = mujoco.MjData(mj)
-        q, qd, ctrl = random_state(rng, near_target=k % 2 == 0)
-        d.qpos[:], d.qvel[:], d.ctrl[:] = q, qd, ctrl
+        d.qpos[:], d.qvel[:], d.ctrl[:] = row
         mujoco.mj_forward(mj, d)
-        saturated.append(np.abs(d.actuator_force) >= mj.actuator_forcerange[:, 1] - 1e-9)
-    share = np.mean(saturated)
-    assert 0.1 < share < 0.9, share
+        at_limit.append(np.abs(d.actuator_force) >= mj.actuator_forcerange[:, 1] - 1e-9)
+    share = np.mean(at_limit, axis=0)
+    assert np.all((share > 0.1) & (share < 0.9)), share
 
 
 UNSUPPORTED = {
