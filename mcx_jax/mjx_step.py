@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from mujoco import mjx
 
 from mcx_jax.envs import chain
@@ -125,7 +126,7 @@ class _Arm:
 
 def _read(m: mjx.Model) -> _Arm:
     # NumPy at once: inside a trace every operation on a concrete JAX array would be traced.
-    m = jax.tree.map(lambda x: x if isinstance(x, jax.core.Tracer) else np.asarray(x), m)
+    m = jax.tree.map(lambda x: x if isinstance(x, Tracer) else np.asarray(x), m)
     _refuse(m)
     bodies = [int(b) for b in m.jnt_bodyid]
     owners, poses = _poses(m, bodies)
@@ -162,7 +163,7 @@ def _refuse(m: mjx.Model) -> None:
     """`refuse_unsupported`, where traced numbers count as zero and MJX's static flags for them."""
     view: dict[str, Any] = {f.name: getattr(m, f.name) for f in fields(m)}
     for name, value in view.items():
-        if isinstance(value, jax.core.Tracer):
+        if isinstance(value, Tracer):
             view[name] = np.zeros(value.shape)
     private: Any = m.opt._impl
     options = {
@@ -184,7 +185,7 @@ def _refuse(m: mjx.Model) -> None:
 
 def _numbers(leaf: Any) -> tuple[Scalar, ...]:
     """The scalars of a vector: Python floats, or traced if the vector is."""
-    if isinstance(leaf, jax.core.Tracer):
+    if isinstance(leaf, Tracer):
         return tuple(leaf[i] for i in range(leaf.shape[0]))
     return tuple(float(x) for x in np.asarray(leaf, np.float64))
 
@@ -330,7 +331,7 @@ def _actuate(arm: _Arm, q: list, qd: list, ctrl: jax.Array):
 def _cartesian(arm: _Arm, angles: list, xfrc: jax.Array) -> list[Scalar]:
     """Joint torques of (nbody, 6) force N and torque N m at the centres of mass, in world axes."""
     n = arm.model.nq
-    if not isinstance(xfrc, jax.core.Tracer) and not np.any(np.asarray(xfrc)):
+    if not isinstance(xfrc, Tracer) and not np.any(np.asarray(xfrc)):
         return [0.0] * n
     rotation, origin = EYE, ZERO
     frames = []

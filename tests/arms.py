@@ -4,7 +4,8 @@ import mujoco
 import numpy as np
 
 HEAD = """<mujoco><compiler angle="radian"/>
-<option timestep="0.002" gravity="1.5 -3 -8.5"><flag contact="disable" constraint="disable"/></option>
+<option timestep="0.002" gravity="1.5 -3 -8.5">
+<flag contact="disable" constraint="disable"/></option>
 <default><geom type="ellipsoid" size=".08 .05 .03"/></default>
 """
 
@@ -109,8 +110,7 @@ INTEGRATORS = {
 }
 
 QUICK = {"xla_backend_optimization_level": 0}
-"""Compiler options for programs that run once: compiled in half the time. Float64 only: what is
-promised in float32 is promised of the program that users run."""
+"""Compiler options for programs that run once: compiled in half the time."""
 
 
 def load(arm: str, integrator: str = "euler") -> mujoco.MjModel:

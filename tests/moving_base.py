@@ -16,12 +16,12 @@ def free_base_model(arm: str | mujoco.MjModel) -> mujoco.MjModel:
     body.mass, body.inertia = 1.0, [1.0, 1.0, 1.0]
     body.explicitinertial = True
     child = mujoco.MjSpec.from_file(arm) if isinstance(arm, str) else arm
+    spec.option.integrator = child.option.integrator  # not used: attaching warns if they differ
     body.add_frame().attach_body(child.worldbody.first_body(), "", "")
     spec.option.disableflags = int(
         mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
     )
     spec.option.timestep = child.option.timestep
-    spec.option.integrator = child.option.integrator  # not used: attaching warns if they differ
     return spec.compile()
 
 

@@ -87,7 +87,7 @@ def test_a_loop_in_float32():
     mj = model("four", "euler")
     m = mjx.put_model(mj)
     d = start(m, mj)
-    _, got = jax.jit(lambda d: loop(step)(m, d))(d)
+    _, got = jax.jit(lambda d: loop(step)(m, d), compiler_options=arms.QUICK)(d)
     assert got["qpos"].dtype == jnp.float32
     c = mujoco.MjData(mj)
     for i in range(ROWS):

@@ -114,8 +114,9 @@ def substeps(
     blank = mjx.make_data(m)
 
     def body(i, state):
-        actuated, commands = servo(m, *state, ctrl)
-        d = blank.replace(qpos=state[0], qvel=state[1], ctrl=commands)
+        q, qd = state
+        actuated, commands = servo(m, q, qd, ctrl)
+        d = blank.replace(qpos=q, qvel=qd, ctrl=commands)
         d = mjx.com_vel(m, mjx.com_pos(m, mjx.kinematics(m, d)))
         d = mjx.step(actuated, d.replace(xfrc_applied=inertial_wrenches(m, d, base_at(i))))
         return d.qpos, d.qvel
