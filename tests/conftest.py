@@ -45,7 +45,10 @@ CHEAP = (
 )
 """File stems that take seconds, cheapest first, so that a mistake shows early."""
 
-EXPENSIVE = ("test_ik", "test_train_command", "test_physics", "test_ppo_trainer", "test_v2v")
+EXPENSIVE = (
+    *("test_ik", "test_mjx_step", "test_train_command", "test_physics"),
+    *("test_ppo_trainer", "test_v2v"),
+)
 """File stems that take a minute or more on two cores. Files in neither list come between."""
 
 

@@ -298,7 +298,9 @@ def test_gradient_of_ten_steps():
         theirs = weighted(functools.partial(mjx_engine.substeps, device), 10)
         slope = np.asarray(quick(jax.grad(ours))(x))
         high, low = np.split(np.asarray(quick(jax.vmap(ours))(x + h * axes)), 2)
-        mjx_slope = quick(jax.vmap(lambda v: jax.jvp(theirs, (x,), (v,))[1]))(np.eye(24))
+        mjx_slope = np.asarray(
+            quick(jax.vmap(lambda v: jax.jvp(theirs, (x,), (v,))[1]))(np.eye(24))
+        )
     size = np.abs(slope).max()
     check({"gradient, differences": np.abs(slope - (high - low) / (2 * h)).max() / size})
     check({"gradient, engines": np.abs(slope - mjx_slope).max() / size})
