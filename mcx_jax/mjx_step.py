@@ -17,7 +17,7 @@ import numpy as np
 from jax.core import Tracer
 from mujoco import mjx
 
-from mcx_jax.envs import chain
+from mcx_jax.envs import dynamics
 from mcx_jax.envs.model import ChainModel, Link, refuse_unsupported
 from mcx_jax.spatial import (
     EYE,
@@ -68,8 +68,8 @@ def step(m: mjx.Model, d: mjx.Data) -> mjx.Data:
     arm = _read(m)
     n = arm.model.nq
     q, qd = [d.qpos[i] for i in range(n)], [d.qvel[i] for i in range(n)]
-    angles = chain.joint_sincos(arm.model, q)
-    bias = chain.bias_forces(arm.model, angles, qd, (ZERO, ZERO, vscale(-1.0, arm.gravity)))
+    angles = dynamics.joint_sincos(arm.model, q)
+    bias = dynamics.bias_forces(arm.model, angles, qd, (ZERO, ZERO, vscale(-1.0, arm.gravity)))
     lengths, forces, actuation, slopes = _actuate(arm, q, qd, d.ctrl)
     dampings = [link.damping for link in arm.model.links]
     passive = [
@@ -78,15 +78,15 @@ def step(m: mjx.Model, d: mjx.Data) -> mjx.Data:
     ]
     applied = [d.qfrc_applied[i] + x for i, x in enumerate(_cartesian(arm, angles, d.xfrc_applied))]
     smooth = [total([-b, *x]) for b, *x in zip(bias, passive, actuation, applied, strict=True)]
-    matrix = chain.mass_matrix(arm.model, angles)
-    qacc = chain.solve(chain.factor(matrix), smooth)
+    matrix = dynamics.mass_matrix(arm.model, angles)
+    qacc = dynamics.solve(dynamics.factor(matrix), smooth)
     if arm.model.integrator == "implicitfast":
         dampings = [add(x, y) for x, y in zip(dampings, slopes, strict=True)]
     h_s = arm.timestep_s
     for row, damping in zip(matrix, dampings, strict=True):
         row[-1] = add(row[-1], mul(h_s, damping))
     damped = any(not (isinstance(x, float) and x == 0.0) for x in dampings)
-    advance = chain.solve(chain.factor(matrix), smooth) if damped else qacc
+    advance = dynamics.solve(dynamics.factor(matrix), smooth) if damped else qacc
     qd = [v + h_s * a for v, a in zip(qd, advance, strict=True)]
     q = [x + h_s * v for x, v in zip(q, qd, strict=True)]
 
@@ -335,7 +335,7 @@ def _cartesian(arm: _Arm, angles: list, xfrc: jax.Array) -> list[Scalar]:
         return [0.0] * n
     rotation, origin = EYE, ZERO
     frames = []
-    for link, turn in zip(arm.model.links, chain.link_rotations(arm.model, angles), strict=True):
+    for link, turn in zip(arm.model.links, dynamics.link_rotations(arm.model, angles), strict=True):
         rotation, origin = _compose((rotation, origin), (turn, link.position))
         frames.append((rotation, origin))
     torques: list[Scalar] = [0.0] * n
