@@ -5,6 +5,7 @@ The dynamics are `envs.dynamics`, their reverse mode is `envs.adjoint`.
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -110,7 +111,7 @@ def _accelerations_backward(model, integrator, saved, cotangent):
     mu = stage(wall, solve, factors, cotangent)
     d_q, d_qd, d_base = inverse_dynamics_gradient(model, wall, angles, qd, accelerations, base, mu)
     _, pull = jax.vjp(lambda *motors: actuate(model, *motors)[0], q, qd, ctrl)
-    by_torque = pull(list(mu))
+    by_torque: Any = pull(list(mu))
     d_motors = (_minus(by_torque[0], d_q), _minus(by_torque[1], d_qd), by_torque[2])
     return d_motors, jax.tree.map(lambda x: -x, d_base), None
 
