@@ -44,7 +44,7 @@ def poses(knots: np.ndarray, steps: np.ndarray) -> list[np.ndarray]:
 
 def base_rates(rpy: np.ndarray, rate: np.ndarray, acc: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(T, 3) angular velocity and acceleration in body axes of R = Rz Ry Rx."""
-    roll, pitch = (Rotation.from_euler(axis, rpy[:, k]) for k, axis in enumerate("xy"))
+    roll, pitch = (Rotation.from_euler(axis, rpy[:, [k]]) for k, axis in enumerate("xy"))
     axes = [
         np.broadcast_to([1.0, 0.0, 0.0], rpy.shape),
         roll.inv().apply([0.0, 1.0, 0.0]),
@@ -61,11 +61,11 @@ def base_rates(rpy: np.ndarray, rate: np.ndarray, acc: np.ndarray) -> tuple[np.n
 class Arm:
     """C MuJoCo's arm, on a fixed base for kinematics and on a free one for dynamics."""
 
-    def __init__(self, name: str, integrator: str) -> None:
-        self.fixed = moving_base.load_mujoco(name)
-        self.free = moving_base.free_base_model(moving_base.arm_path(name))
+    def __init__(self, path: str) -> None:
+        self.fixed = mujoco.MjModel.from_xml_path(path)
+        self.free = moving_base.free_base_model(path)
         self.data = mujoco.MjData(self.fixed)
-        self.implicit = integrator == "implicitfast"
+        self.implicit = self.fixed.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         self.is_position = self.fixed.actuator_biasprm[:, 1] != 0
         self.joint = self.fixed.actuator_trnid[:, 0]
         self.site = self.fixed.site("tool").id

@@ -81,7 +81,8 @@ def implicit_damping(fixed: mujoco.MjModel, q, qd, ctrl) -> np.ndarray:
     mujoco.mj_fwdPosition(fixed, d)
     mujoco.mj_fwdVelocity(fixed, d)
     mujoco.mj_fwdActuation(fixed, d)
-    inside = np.abs(d.actuator_force) < fixed.actuator_forcerange[:, 1]
+    limit = np.where(fixed.actuator_forcelimited, fixed.actuator_forcerange[:, 1], np.inf)
+    inside = np.abs(d.actuator_force) < limit
     slope = -fixed.actuator_biasprm[:, 2] * inside
     implicit = np.zeros(fixed.nv)
     np.add.at(implicit, fixed.actuator_trnid[:, 0], fixed.opt.timestep * slope)
