@@ -53,10 +53,7 @@ class ExportConfig:
         if not path.absolute().parent.is_dir():
             raise UserError(f"--out {self.out}: no such directory")
         if path.suffix == ".onnx" and importlib.util.find_spec("onnx") is None:
-            raise UserError(
-                f"--out {self.out}: needs the package onnx; install the extra: "
-                "pip install 'mcx_jax[export]'"
-            )
+            raise UserError(f"--out {self.out}: needs the package onnx; install the 'export' extra")
 
 
 def export(policy: "Policy", path: Path) -> None:

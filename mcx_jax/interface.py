@@ -24,8 +24,8 @@ ACTION_TABLE = (
 )
 """Order of the action."""
 ACTION_USE = (
-    "the arm aims its tool at (R_B_G exp(0.01 turn_G), p_B_G + R_B_G 0.01 shift_G) in B, by inverse "
-    "kinematics, in place of the goal; an action of zero is no correction"
+    "the arm aims its tool at (R_B_G exp(0.01 turn_G), p_B_G + R_B_G 0.01 shift_G) in B, by "
+    "inverse kinematics, in place of the goal; an action of zero is no correction"
 )
 
 

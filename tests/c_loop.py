@@ -89,9 +89,7 @@ class Arm:
             turn = Rotation.from_matrix(target[:3, :3] @ tool[:3, :3].T).as_rotvec()
             e = np.concatenate([target[:3, 3] - tool[:3, 3], turn])
             far = np.linalg.norm(e[:3]) + np.linalg.norm(e[3:]) > 0.1
-            step = jacobian.T @ np.linalg.solve(
-                jacobian @ jacobian.T + 3e-2 * far * np.eye(6), e
-            )
+            step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + 3e-2 * far * np.eye(6), e)
             q = q + step * min(1.0, 2.0 / np.linalg.norm(step))
         return q
 

@@ -89,4 +89,11 @@ def implicit_damping(fixed: mujoco.MjModel, q, qd, ctrl) -> np.ndarray:
     return implicit
 
 
-__all__ = ["acceleration", "arm_path", "free_base_model", "implicit_damping", "load_mujoco", "scratch"]
+__all__ = [
+    "acceleration",
+    "arm_path",
+    "free_base_model",
+    "implicit_damping",
+    "load_mujoco",
+    "scratch",
+]
