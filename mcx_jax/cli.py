@@ -64,6 +64,9 @@ def _one_line(box: str) -> str:
         return f"{match[1]} {match[2]}: must be a number"
     if match := re.search(r"invalid choice '(.*?)' for argument '(.*?)'.*\((.*?),?\)", text):
         return f"{match[2]} {match[1]}: use one of {match[3].replace(chr(39), '')}"
+    if match := re.match(r"Missing from [^:]*: (?:(--\S+) )?(\S+) (.*?)\(required\)", text):
+        # "--out STR what it is" or, without a flag, "RUN what it is"
+        return f"{match[1] or match[2]} is missing: {match[3].strip()}"
     if match := re.search(r"Missing value for argument '(.*?)'", text):
         return f"{match[1]} needs a value"
     if match := re.search(r"Unrecognized options: (.*)", text):

@@ -9,7 +9,7 @@ import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
@@ -23,7 +23,7 @@ WHO = ("ik", "extrapolate", "preview")
 class EvaluateConfig:
     """Evaluate a controller on test motion that no training has seen."""
 
-    who: tyro.conf.Positional[str]
+    who: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="WHO")]
     """ik, extrapolate, preview, a run directory, or a policy .npz file."""
     episodes: int = 50
     """Test episodes per sea state (paper: 50)."""
@@ -203,10 +203,9 @@ def load_controller(who: str) -> tuple[str, Any]:
         raise UserError(
             f"unknown controller '{who}': use {', '.join(WHO)}, a run directory or a policy .npz"
         )
-    from mcx_jax.policy import PolicyController, load_policy
+    from mcx_jax.policy import PolicyController, load_run
 
-    policy = load_policy(path / "policy.npz" if path.is_dir() else path)
-    return who.rstrip("/"), PolicyController(policy)
+    return who.rstrip("/"), PolicyController(load_run(path))
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -1,11 +1,13 @@
 """A trained policy by itself: what it is, how it acts, and its file.
 
 The file is a plain `.npz` without pickles: weights under their names (`policy/net/head/kernel`),
-the observation statistics, and one JSON string `metadata` (format version, network, configuration
-of the training run). NumPy alone reads it.
+the observation statistics, and two JSON strings: `metadata` (format version, network, configuration
+of the training run) and `interface` (`mcx_jax.interface`: what goes in and out, names, units,
+frames). NumPy alone reads it; `mcx_jax.numpy_policy` runs it.
 """
 
 import dataclasses
+import io
 import json
 import os
 import zipfile
@@ -17,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct, traverse_util
 
+from mcx_jax import interface
 from mcx_jax.errors import UserError
 from mcx_jax.ppo.networks import Carry, Params, PolicyNet, init_params, step
 from mcx_jax.ppo.networks import init_carry as zero_carry
@@ -48,6 +51,11 @@ class PolicyMeta:
     def net(self) -> PolicyNet:
         """The network, without weights."""
         return PolicyNet(self.hidden, self.action_size)
+
+    @property
+    def interface(self) -> dict[str, Any]:
+        """What goes in and out, as JSON can hold it."""
+        return interface.describe(self.net, self.obs_size, self.config)
 
 
 @struct.dataclass
@@ -102,17 +110,44 @@ class PolicyController:
         return act(self.policy, memory, state.obs)
 
 
+def npz_bytes(policy: Policy) -> bytes:
+    """The content of a policy file."""
+    metadata = {"kind": KIND, "format": FORMAT, **dataclasses.asdict(policy.meta)}
+    texts = {
+        "metadata": json.dumps(metadata),
+        "interface": json.dumps(policy.meta.interface, indent=1),
+    }
+    content = io.BytesIO()
+    np.savez(content, allow_pickle=False, **texts, **named_arrays(policy))
+    return content.getvalue()
+
+
 def save_policy(path: str | Path, policy: Policy) -> None:
     """Write a policy file; whole or not at all."""
-    path = Path(path)
-    arrays = {name: np.asarray(x) for name, x in _named(policy).items()}
-    metadata = {"kind": KIND, "format": FORMAT, **dataclasses.asdict(policy.meta)}
+    write_whole(Path(path), npz_bytes(policy))
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file under a temporary name beside it, then move it there."""
     partial = path.with_name(f".{path.name}.partial")
-    with partial.open("wb") as file:
-        np.savez(file, allow_pickle=False, metadata=json.dumps(metadata), **arrays)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
+    try:
+        with partial.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def load_run(run: str | Path) -> Policy:
+    """The policy of a run directory, or of a policy file.
+
+    Raises:
+        UserError: as `load_policy`.
+    """
+    path = Path(run)
+    return load_policy(path / "policy.npz" if path.is_dir() else path)
 
 
 def load_policy(path: str | Path) -> Policy:
@@ -137,8 +172,13 @@ def load_policy(path: str | Path) -> Policy:
     )
 
 
-def _named(policy: Policy) -> dict[str, Any]:
+def named_arrays(policy: Policy) -> dict[str, np.ndarray]:
     """All arrays of a policy under the names that they have in the file."""
+    return {name: np.asarray(x) for name, x in _named(policy).items()}
+
+
+def _named(policy: Policy) -> dict[str, Any]:
+    """Leaves of a policy, arrays or shapes, by name."""
     weights = traverse_util.flatten_dict(policy.params["params"], sep="/")
     named = {f"policy/{name}": x for name, x in weights.items()}
     stats = policy.obs_stats

@@ -129,16 +129,9 @@ def c_step(integrator: str, q, qd, ctrl, base) -> tuple[np.ndarray, np.ndarray]:
     # Any orientation of the deck gives the same; one that is not level tests more.
     tilt = Rotation.from_rotvec([0.3, -0.5, 0.8]).as_matrix()
     w, al, acc = base[:3], base[3:6], tilt @ base[6:] - [0.0, 0.0, 9.81]
-    implicit = np.zeros(6)
+    implicit = 0.0
     if integrator == "implicitfast":
-        d = moving_base.scratch(fixed)
-        d.qpos[:], d.qvel[:], d.ctrl[:] = q, qd, ctrl
-        mujoco.mj_fwdPosition(fixed, d)
-        mujoco.mj_fwdVelocity(fixed, d)
-        mujoco.mj_fwdActuation(fixed, d)
-        inside = np.abs(d.actuator_force) < fixed.actuator_forcerange[:, 1]
-        slope = -fixed.actuator_biasprm[:, 2] * inside
-        np.add.at(implicit, fixed.actuator_trnid[:, 0], H_S * slope)
+        implicit = moving_base.implicit_damping(fixed, q, qd, ctrl)
     qdd = moving_base.acceleration(free, q, qd, ctrl, tilt, w, al, acc, implicit)
     qd = qd + H_S * qdd
     return q + H_S * qd, qd
