@@ -143,7 +143,7 @@ def substep(
     """One physics step, semi-implicit as MuJoCo: new velocities, then positions with them."""
     h = model.timestep_s
     motors = (tuple(q), tuple(qd), tuple(ctrl))
-    qdd = joint_accelerations(model, integrator, motors, base, wall)
+    qdd: Any = joint_accelerations(model, integrator, motors, base, wall)
     qd = [v + h * a for v, a in zip(qd, qdd, strict=True)]
     return [x + h * v for x, v in zip(q, qd, strict=True)], qd
 
