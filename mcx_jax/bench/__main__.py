@@ -44,38 +44,47 @@ def run(quick: bool, say) -> dict[str, Any]:
         say: prints a line of progress.
     """
     from dataclasses import asdict
+    from functools import partial
+
+    import jax
 
     from mcx_jax.bench import physics, program, startup_time
     from mcx_jax.config import TrainConfig
+    from mcx_jax.envs.v2v import make_env
+    from mcx_jax.ppo import trainer
 
     figures: dict[str, Any] = {"device": device(), "versions": versions()}
     figures["physics"] = rows = []
     for engine, speed in physics.ENGINES.items():
-        for envs in QUICK_ENVS if quick else FEW_ENVS if engine == "mjx" else ENVS:
+        for envs in batch_sizes(engine, quick):
             rows.append({"engine": engine, "envs": envs, "steps_per_s": speed(envs)})
             say(f"{engine:>10} {envs:6d} environments: {rows[-1]['steps_per_s']:12,.0f} steps/s")
     figures["ratio"] = ratios(rows)
     for name, value in figures["ratio"].items():
         say(f"{name.replace('_', ' ')}: {value:.1f} times")
-    figures["gradient_over_forward"] = physics.gradient_over_forward(RATIO_ENVS)
-    say(f"gradient of ten physics steps: {figures['gradient_over_forward']:.1f} times forward")
+    if not quick:
+        figures["gradient_over_forward"] = physics.gradient_over_forward(RATIO_ENVS)
+        say(f"gradient of ten physics steps: {figures['gradient_over_forward']:.1f} times forward")
 
     config = TrainConfig()
-    env = program.build(config)
+    env = make_env(config.env, config.motion)
+    state = jax.jit(partial(trainer.init, config))(env, jax.random.key(0))
     figures["environment"] = []
-    for envs in (RATIO_ENVS,) if quick else ENVIRONMENT_ENVS:
-        us = program.environment_us(env, envs)
+    for envs in (config.num_envs,) if quick else ENVIRONMENT_ENVS:
+        at_start = state.actors.env_state if envs == config.num_envs else program.reset(env, envs)
+        us = program.environment_us(env, at_start)
         figures["environment"].append({"envs": envs, "steps_per_s": 1e6 / us, "us_per_step": us})
         say(f"environment, {envs} environments: {1e6 / us:,.0f} control steps/s ({us:.2f} us)")
     speeds = {row["envs"]: row["steps_per_s"] for row in figures["environment"]}
-    figures["environment_steps_per_s"] = speeds[RATIO_ENVS]
-    figures["breakdown_us"] = program.breakdown_us(env, RATIO_ENVS)
-    parts = ", ".join(f"{name} {us:.2f}" for name, us in figures["breakdown_us"].items())
-    say(f"parts of a control step alone, us: {parts}")
+    figures["environment_steps_per_s"] = speeds[config.num_envs]
+    if not quick:
+        figures["breakdown_us"] = program.breakdown_us(env, state.actors.env_state)
+        parts = ", ".join(f"{name} {us:.2f}" for name, us in figures["breakdown_us"].items())
+        say(f"parts of a control step alone, us: {parts}")
     figures["peak_memory_gib"] = peak_memory_gib()
     say(f"peak memory so far, no learner: {figures['peak_memory_gib']:.2f} GiB")
 
-    speed = program.training_speed(config, env)
+    speed = program.training_speed(config, env, state)
     figures.update(asdict(speed))
     figures["matmul_gflops"] = program.matmul_gflops()
     figures["learner_matmul_share"] = speed.learner_gflops / figures["matmul_gflops"]
@@ -94,6 +103,13 @@ def run(quick: bool, say) -> dict[str, Any]:
             )
         )
     return figures
+
+
+def batch_sizes(engine: str, quick: bool) -> tuple[int, ...]:
+    """Numbers of environments to time an engine with."""
+    if engine == "mjx":
+        return (RATIO_ENVS,) if quick else FEW_ENVS
+    return QUICK_ENVS if quick else ENVS
 
 
 def ratios(rows: list[dict[str, Any]]) -> dict[str, float]:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from mcx_jax.bench.timing import median_s
 from mcx_jax.config import CONTROL_DT_S, SUBSTEPS, TrainConfig
 from mcx_jax.envs import ik, lag, observe, vessels
-from mcx_jax.envs.v2v import ArmState, EnvState, V2VEnv, make_env
+from mcx_jax.envs.v2v import ArmState, EnvState, V2VEnv
 from mcx_jax.ppo import rollout, trainer
 from mcx_jax.ppo.experience import judge
 from mcx_jax.ppo.update import learn
@@ -21,29 +21,19 @@ STEPS = 10
 """Control steps in a timed call of the environment."""
 
 
-def build(config: TrainConfig) -> V2VEnv:
-    """The environment of a training run."""
-    return make_env(config.env, config.motion)
-
-
 def reset(env: V2VEnv, envs: int) -> EnvState:
     """Environments at the start of an episode, leaves (..., envs)."""
     return jax.jit(partial(rollout.reset_all, num_envs=envs))(env, jax.random.key(0))
 
 
-def environment_us(env: V2VEnv, envs: int) -> float:
+def breakdown_us(env: V2VEnv, state: EnvState) -> dict[str, float]:
+    """Microseconds that each part of a control step takes alone; in the whole they share work and
+    caches, so they need not add up to it."""
+    return {name: environment_us(env, state, part) for name, part in PARTS.items()}
+
+
+def environment_us(env: V2VEnv, state: EnvState, step=V2VEnv.step) -> float:
     """Microseconds of one control step of one environment, no policy."""
-    return _environment_us(env, reset(env, envs), V2VEnv.step)
-
-
-def breakdown_us(env: V2VEnv, envs: int) -> dict[str, float]:
-    """Microseconds that each part of a control step takes alone; they share caches and compiled
-    loops in the whole, so they need not add up to it."""
-    state = reset(env, envs)
-    return {name: _environment_us(env, state, part) for name, part in PARTS.items()}
-
-
-def _environment_us(env: V2VEnv, state: EnvState, step) -> float:
     envs = state.step.shape[0]
     action = jnp.zeros((6,))
 
@@ -100,12 +90,11 @@ class TrainingSpeed:
     """Useful floating-point operations of the learner's matrix products, 1e9/s."""
 
 
-def training_speed(config: TrainConfig, env: V2VEnv) -> TrainingSpeed:
+def training_speed(config: TrainConfig, env: V2VEnv, state: trainer.TrainState) -> TrainingSpeed:
     """Time the rollout, the learner and the whole iteration of PPO."""
     # The KL stop would skip policy steps: here every planned step is computed.
     config = replace(config, ppo=replace(config.ppo, target_kl=1e6))
     ppo, nets = config.ppo, trainer.networks_of(config.ppo, env.action_size)
-    state = jax.jit(partial(trainer.init, config))(env, jax.random.key(0))
     key = jax.random.key(1)
     keys = trainer._step_keys(ppo, key)
     policy, value = state.learner.policy.params, state.learner.value.params

@@ -1,0 +1,131 @@
+"""The bench's arithmetic and its contract; its speeds are nobody's test."""
+
+import json
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mcx_jax.bench import __main__ as bench
+from mcx_jax.bench import physics, program, startup_time, timing
+from mcx_jax.config import preset_config
+from mcx_jax.ppo import trainer
+from mcx_jax.ppo.networks import init_carry, init_params, unroll
+
+CONTRACT = {
+    "device",
+    "versions",
+    "physics",
+    "ratio",
+    "environment_steps_per_s",
+    "rollout_steps_per_s",
+    "training_steps_per_s",
+    "learner_matmul_share",
+    "compile_s",
+}
+ROWS = [
+    {"engine": "c-rollout", "envs": 64, "steps_per_s": 3e5},
+    {"engine": "c-batch", "envs": 2048, "steps_per_s": 4e5},
+    {"engine": "mjx", "envs": 2048, "steps_per_s": 1e5},
+    {"engine": "chain", "envs": 2048, "steps_per_s": 6e6},
+    {"engine": "chain", "envs": 16384, "steps_per_s": 8e6},
+]
+
+
+def test_ratios_take_the_best_batch_against_c_and_the_same_batch_against_mjx():
+    assert bench.ratios(ROWS) == {"chain_over_c": 20.0, "chain_over_mjx": 60.0}
+
+
+def test_learner_flops_are_those_that_xla_counts():
+    """The formula against the compiler's own count of a gradient, which has the elementwise work
+    too: a few percent at this width."""
+    hidden, inputs, steps, rows = 256, 38, 4, 8
+    net = trainer.networks_of(preset_config("fast").ppo, 6).policy.clone(hidden=hidden)
+    params = init_params(net, jax.random.key(0), inputs)
+    carry, obs = init_carry(net, (rows,)), jnp.ones((steps, rows, inputs))
+
+    def loss(params):
+        return jnp.sum(unroll(net, params, carry, obs)[1] ** 2)
+
+    # One iteration of a loop counts once: take the sum over the steps by hand.
+    counted = jax.jit(jax.grad(loss)).lower(params).compile().cost_analysis()["flops"]
+    wanted = steps * rows * program.learner_flops(inputs, hidden, (6,))
+    looped = 2 * steps * rows * 2 * 2 * hidden * 4 * hidden  # forward and back, inside the scans
+    unlooped = wanted - looped + looped / steps
+    assert counted == pytest.approx(unlooped, rel=0.1)
+
+
+def test_every_engine_takes_the_same_start():
+    model = physics.load_mujoco("paper")
+    q, ctrl = physics.start(model, 3)
+    assert q.shape == (3, 6) and ctrl.shape == (3, 12)
+    np.testing.assert_array_equal(ctrl[:, :6], q)
+    np.testing.assert_array_equal(ctrl[:, 6:], 0.0)
+
+
+@pytest.mark.parametrize("engine", ["c-rollout", "c-batch", "chain"])
+def test_engines_run(engine, monkeypatch):
+    monkeypatch.setattr(timing, "MIN_S", 0.0)
+    monkeypatch.setattr(physics, "LARGE_STEPS", 1)
+    assert physics.ENGINES[engine](2) > 0
+
+
+def test_quick_writes_the_contract(monkeypatch, tmp_path):
+    speed = program.TrainingSpeed(1.0, 2.0, 3.0, 50.0)
+    engines = {name: lambda _: 1e6 for name in ("c-rollout", "c-batch", "mjx", "chain")}
+    monkeypatch.setattr(physics, "ENGINES", engines)
+    monkeypatch.setattr(program, "environment_us", lambda *_: 5.0)
+    monkeypatch.setattr(program, "training_speed", lambda *_: speed)
+    monkeypatch.setattr(program, "matmul_gflops", lambda: 100.0)
+    monkeypatch.setattr(trainer, "init", lambda *_: FakeState())
+    out, plot = tmp_path / "bench.json", tmp_path / "bench.png"
+    bench.main(["--quick", "--json", str(out), "--plot", str(plot)])
+    figures = json.loads(out.read_text())
+    assert set(figures) >= CONTRACT
+    assert figures["environment_steps_per_s"] == 2e5
+    assert figures["learner_matmul_share"] == 0.5
+    assert {row["engine"] for row in figures["physics"]} == set(engines)
+    assert plot.stat().st_size > 10_000
+
+
+@jax.tree_util.register_pytree_node_class
+class FakeState:
+    """A training state of which only the environments' place is read."""
+
+    actors = type("Actors", (), {"env_state": None})
+
+    def tree_flatten(self):
+        return (), None
+
+    @classmethod
+    def tree_unflatten(cls, *_):
+        return cls()
+
+
+@pytest.mark.parametrize(
+    "words, message",
+    [
+        (["--json", "nowhere/b.json"], "--json nowhere/b.json: no such directory"),
+        (["--plot", "b.gif"], "--plot b.gif: the name must end in .png or .svg"),
+    ],
+)
+def test_refusals_come_before_any_work(words, message, monkeypatch):
+    monkeypatch.setattr(bench, "run", None)
+    with pytest.raises(bench.UserError, match=message):
+        bench.main(words)
+
+
+def test_a_training_command_that_fails_is_reported(monkeypatch, tmp_path):
+    real = subprocess.Popen
+
+    def broken(command, **options):
+        return real(
+            [sys.executable, "-c", "print('error: no luck'); raise SystemExit(2)"], **options
+        )
+
+    monkeypatch.setattr(startup_time.subprocess, "Popen", broken)
+    with pytest.raises(bench.UserError, match="gave no metrics: error: no luck"):
+        startup_time.first_metrics_s()
