@@ -80,7 +80,7 @@ def _evaluate(config, env, entries: Sequence[Entry], say) -> tuple[dict[str, Err
 
 def _table_section(rows: Rows) -> Section:
     return Section(
-        "Table 3",
+        "Table 3, ours and the paper's",
         [],
         "Mean and standard deviation over all points, and how far the mean of all points, of the "
         "worst 5 % and 1 %, and the maximum lie below ik's. In italics the paper's figures "
@@ -92,10 +92,10 @@ def _table_section(rows: Rows) -> Section:
 
 def _episode_sections(config, env, ik: Entry, shown, colours, say) -> list[Section]:
     sea = len(env.motion.seas) - 1
-    baseline, others = None, []
+    recorded = []
     for entry in shown or [ik]:
         say(f"recording one episode of {entry.label}")
-        of_ik, of_entry = record(
+        both = record(
             env,
             entry.controller,
             episode=config.show,
@@ -103,9 +103,9 @@ def _episode_sections(config, env, ik: Entry, shown, colours, say) -> list[Secti
             seed=config.seed,
             sea=sea,
         )
-        baseline = baseline or of_ik
-        if entry is not ik:
-            others.append((entry.label, of_entry))
+        recorded.append((entry.label, *both))
+    baseline = recorded[0][1]
+    others = [(label, ours) for label, _, ours in recorded if label != ik.label]
     seconds = config.env.episode_steps * CONTROL_DT_S
     where = f"Test episode {config.show} of sea {env.motion.seas[sea]}, {seconds:g} s"
     return [

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -59,27 +59,35 @@ def check_names(runs: Sequence[str]) -> tuple[str, ...]:
 
 def load_entries(runs: Sequence[str]) -> list[Entry]:
     """Controllers for the names of `check_names`."""
-    short = [_short(who) for who in runs]
-    labels = [s if short.count(s) == 1 else who for s, who in zip(short, runs, strict=True)]
-    return [_load(who, label) for who, label in zip(runs, labels, strict=True)]
+    entries = [_load(who) for who in runs]
+    for shorten in (_without_delay, _name):
+        labels = [shorten(entry) for entry in entries]
+        if len(set(labels)) == len(labels):
+            return [replace(e, label=label) for e, label in zip(entries, labels, strict=True)]
+    return entries
 
 
-def _short(who: str) -> str:
-    path = Path(who)
-    return (
-        path.parent.name if path.name == "policy.npz" else path.stem if path.suffix else path.name
-    )
-
-
-def _load(who: str, label: str) -> Entry:
+def _load(who: str) -> Entry:
     controller = load_controller(who)[1]
     path = policy_path(who)
     if path is None:
-        return Entry(who, label, controller, {}, learned=False, run=None)
+        return Entry(who, who, controller, {}, learned=False, run=None)
     stored = json.loads(controller.policy.meta.config).get("env", {})
     settings = {name: stored[name] for name in OWN_SETTINGS if name in stored}
     run = path.parent if (path.parent / METRICS).is_file() else None
-    return Entry(who, label, controller, settings, learned=True, run=run)
+    return Entry(who, who, controller, settings, learned=True, run=run)
+
+
+def _name(entry: Entry) -> str:
+    """Name of the run directory, or of the policy file."""
+    path = Path(entry.who)
+    return path.parent.name if path.name == "policy.npz" else path.name
+
+
+def _without_delay(entry: Entry) -> str:
+    """The same without the delay in front, which the report says once."""
+    delay = entry.settings.get("delay", "").replace(":", "_")
+    return _name(entry).removeprefix(f"{delay}-")
 
 
 def common_settings(entries: Sequence[Entry], argv: Sequence[str]) -> dict[str, str]:

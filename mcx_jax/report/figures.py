@@ -2,12 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, NullFormatter
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
 
 from mcx_jax.report import style
 
@@ -57,8 +56,10 @@ def boxes(
         axes.set_xscale("log")
     ticks: list[tuple[float, Box]] = []
     y = 0.0
+    edge = axes.get_yaxis_transform()
+    axes.text(1.015, y, "mean", transform=edge, va="center", color=style.MUTED, fontsize=7.5)
     for heading, group in groups:
-        _at_edges(axes, y, heading, "mean")
+        _heading(axes, y, heading)
         for entry in group:
             y += 1.0
             _draw_box(axes, y, entry)
@@ -78,10 +79,10 @@ def boxes(
     return figure
 
 
-def _at_edges(axes: Axes, y: float, left: str, right: str) -> None:
+def _heading(axes: Axes, y: float, text: str) -> None:
     place = axes.get_yaxis_transform()
-    axes.text(0.012, y, left, transform=place, va="center", weight="bold", fontsize=9)
-    axes.text(1.015, y, right, transform=place, va="center", color=style.MUTED, fontsize=7.5)
+    box = {"facecolor": "white", "edgecolor": "none", "pad": 1.5}  # over the grid
+    axes.text(*(0.012, y, text), transform=place, va="center", weight="bold", fontsize=9, bbox=box)
 
 
 def _draw_box(axes: Axes, y: float, b: Box) -> None:
@@ -111,7 +112,7 @@ def _pale(colour: str) -> tuple[float, ...]:
 def _plain_log(axis) -> None:
     """0.1, 1, 10 instead of powers; 2 and 5 as well where there are few of them."""
     low, high = axis.get_view_interval()
-    many = high / low > 100
+    many = high / low > 300
     subs = (1.0,) if many else (1.0, 2.0, 5.0)
     axis.get_major_locator().set_params(subs=subs)
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -148,7 +149,8 @@ def lines(
     if level is not None:
         axes.axhline(level[2], color=level[1], lw=1.2, ls=(0, (5, 3)))
         labels.append(level)
-    axes.set_xlim(min(c.x[0] for c in curves), max(c.x[-1] for c in curves))
+    axes.set_xlim(0.0, max(c.x[-1] for c in curves))
+    axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
     if log:
         _plain_log(axes.yaxis)
     else:
@@ -169,21 +171,26 @@ def follow(
 
     Args:
         tracks: (label, colour, values) of goal, reference and tool.
-        late: (time the goal passes a level, time the tool does, the level).
+        late: (time the goal passes a level, time the tool does, the level): an arrow.
     """
     figure, axes = style.panel(title)
-    styles: tuple[dict[str, Any], ...] = (
-        {"lw": 3.4, "alpha": 0.45},
-        {"lw": 1.2, "ls": (0, (2, 1.5))},
-        {"lw": 1.9},
-    )
-    for (_, colour, values), options in zip(tracks, styles, strict=True):
-        axes.plot(time_s, values, color=colour, **options)
+    goal, reference, tool = tracks
+    axes.plot(time_s, goal[2], color=style.GOAL_BAND, lw=5)
+    axes.plot(time_s, reference[2], color=reference[1], lw=1.2, ls=(0, (2, 1.5)))
+    axes.plot(time_s, tool[2], color=tool[1], lw=1.9)
     axes.set_xlabel("time, s")
     axes.set_ylabel(ylabel)
     axes.set_xlim(time_s[0], time_s[-1])
     start, end, level = late
     if abs(end - start) > 0.012 * (time_s[-1] - time_s[0]):
+        axes.annotate(
+            f"{1e3 * (end - start):.0f} ms",
+            (max(start, end), level),
+            xytext=(9, -3),
+            textcoords="offset points",
+            va="top" if goal[2][-1] > goal[2][0] else "bottom",
+            fontsize=9,
+        )
         axes.annotate(
             "",
             (end, level),
@@ -212,18 +219,24 @@ def spectrum(
     for name, colour, hz, density, target_hz, target in seas:
         axes.plot(hz[1:], density[1:], color=colour, lw=2.4, alpha=0.75)
         axes.plot(target_hz, target, color=style.INK, lw=0.9, ls=(0, (4, 2)))
+        # On the low-frequency flank, where the seas lie apart, along the steep line.
         top = int(np.argmax(density))
+        flank = int(np.searchsorted(density[1 : top + 1], 3e-4 * peak)) + 1
         axes.annotate(
-            *(name, (hz[top], density[top])),
-            xytext=(0, 4),
+            *(name, (hz[flank], density[flank])),
+            xytext=(3, 0),
             textcoords="offset points",
             color=colour,
-            ha="center",
+            rotation=90,
+            va="center",
+            fontsize=8.5,
             weight="bold",
         )
-    axes.set_xlim(0.1, 1.7)
+    axes.set_xlim(0.14, 1.6)
     axes.set_ylim(1e-5 * peak, 6 * peak)
     axes.set_xlabel("frequency, Hz (laboratory)")
     axes.set_ylabel(ylabel)
     _plain_log(axes.xaxis)
+    if seas[0][4].size:
+        axes.text(0.98, 0.96, "dashed: target", transform=axes.transAxes, ha="right", va="top")
     return figure

@@ -84,7 +84,7 @@ def tracking(
     for label, e in [("ik", ik), *others]:
         lag = 1e3 * lag_s(e.goal_m[warm], e.tool_m[warm])
         lags.append(f"{label} {abs(lag):.0f} ms {'late' if lag >= 0 else 'early'}")
-        title = f"{label}: tool {abs(lag):.0f} ms {'late' if lag >= 0 else 'early'}"
+        title = f"{label}: tool {abs(lag):.0f} ms {'late' if lag >= 0 else 'early'} on average"
         panels.append(
             Panel(
                 f"follow_{len(panels)}",
@@ -106,9 +106,9 @@ def tracking(
         panels,
         f"{where}. First: {ZOOM_S:g} s around the goal's fastest movement along {'xyz'[axis]} of "
         "the arm's base, the same instant for everyone. Broad: goal; dotted: where the late joint "
-        "reference would put the tool; solid: tool; the arrow is the tool's delay there. The "
-        f"delay in the titles ({', '.join(lags)}) is the shift that fits the whole episode best, "
-        "all three axes. Then: the errors over the whole episode.",
+        "reference would put the tool; solid: tool; the arrow: the tool's delay there and then. "
+        f"In the titles ({', '.join(lags)}): the shift that fits the whole episode best, all "
+        "three axes. Then: the errors over the whole episode.",
     )
 
 
@@ -129,7 +129,7 @@ def _follow(title: str, e: Episode, axis: int, window: slice, colour: str) -> Fi
     return figures.follow(
         title,
         time_s,
-        [("goal", style.INK, goal), ("reference", colour, reference), ("tool", colour, tool)],
+        [("goal", style.GOAL, goal), ("reference", colour, reference), ("tool", colour, tool)],
         f"{'xyz'[axis]} in the arm base's frame, mm",
         (late[0], late[1], level),
     )
@@ -164,7 +164,7 @@ def effort(
     for j in np.flatnonzero(np.isfinite(limits_nm)):
         share = lambda e, j=j: 100.0 * np.abs(e.torque_nm[WARM_UP_STEPS:, j]) / limits_nm[j]  # noqa: E731
         rows = [figures.box(k, colours[k], share(e)) for k, e in [("ik", ik), *others]]
-        groups.append((f"joint {j + 1} of {limits_nm[j]:.0f} N m", rows))
+        groups.append((f"joint {j + 1}, limit {limits_nm[j]:.0f} N m", rows))
     if groups:
         drawn = figures.boxes("Torque use", groups, "share of the force limits, %", log=False)
         panels.append(Panel("torque", "Share of the force limits that every joint uses", drawn))

@@ -18,6 +18,8 @@ WIDTH_IN = 4.8
 DPI = 200
 
 INK, MUTED, GRID = "#1f2328", "#5f6670", "#e3e6ea"
+GOAL, GOAL_BAND = "#7d5f00", "#f2cc5c"
+"""The goal's letters, and the broad line that the tool should stay on."""
 NAMED = {"ik": "#5f6670", "extrapolate": "#a6611a", "preview": "#018571"}
 RUNS = ("#0072b2", "#d1480b", "#882255", "#117733", "#332288", "#aa4499")
 """Of Okabe & Ito's and Tol's sets, those that are dark enough for letters on white."""
