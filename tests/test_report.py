@@ -259,7 +259,8 @@ def test_a_browser_shows_it(made, tmp_path, width_px):
     if browser is None:
         pytest.skip(f"no browser here (looked for {', '.join(BROWSERS)})")
     probe = (
-        "<script>const root = document.documentElement; addEventListener('load', () => { document.title = JSON.stringify({"
+        "<script>const root = document.documentElement;"
+        "addEventListener('load', () => { document.title = JSON.stringify({"
         "images: [...document.images].filter(i => i.complete && i.naturalWidth > 0).length,"
         "over: root.scrollWidth - root.clientWidth}) })</script></body>"
     )

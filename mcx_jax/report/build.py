@@ -57,7 +57,7 @@ def build(
         sections.lead(rows, [e.label for e in entries if e.learned]),
         chapters,
         pngs,
-        facts := _facts(config, argv),
+        facts := _facts(config, entries, argv),
     )
     return html, pngs, {"made": facts, "rows": [row for part in rows.values() for row in part]}
 
@@ -79,13 +79,24 @@ def _evaluate(config, env, entries: Sequence[Entry], say) -> tuple[dict[str, Err
 
 
 def _table_section(rows: Rows) -> Section:
+    bad = [
+        f"{k} {r['invalid_episodes']} in {r['sea']}"
+        for k, part in rows.items()
+        for r in part
+        if r["invalid_episodes"]
+    ]
     return Section(
         "Table 3, ours and the paper's",
         [],
         "Mean and standard deviation over all points, and how far the mean of all points, of the "
         "worst 5 % and 1 %, and the maximum lie below ik's. In italics the paper's figures "
         "(Herland & Bach, AAAI 2023, table 3), where it has this delay and sea; its ik is what "
-        "its agents' errors and improvements imply.",
+        "its agents' errors and improvements imply. "
+        + (
+            f"Invalid episodes, counted all the same: {', '.join(bad)}."
+            if bad
+            else "No episode was invalid."
+        ),
         table(rows),
     )
 
@@ -130,19 +141,22 @@ def _learning_sections(config, entries: Sequence[Entry], rows: Rows, colours) ->
     return [sections.learning(runs, colours, ik if same else {})]
 
 
-def _facts(config, argv: Sequence[str]) -> dict[str, str]:
+def _facts(config, entries: Sequence[Entry], argv: Sequence[str]) -> dict[str, str]:
     from importlib.metadata import version
 
     from mcx_jax.bench.__main__ import device, versions
 
     packages = {**versions(), "matplotlib": version("matplotlib")}
+    metas = [(e, e.controller.policy.meta) for e in entries if e.learned]
+    policies = [f"{e.label} = {e.who}, iteration {m.iteration}, seed {m.seed}" for e, m in metas]
     return {
-        "command": f"`python -m mcx_jax.report {shlex.join(argv)}`",
+        "command": f"python -m mcx_jax.report {shlex.join(argv)}",
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "versions": ", ".join(f"{name} {value}" for name, value in packages.items()),
         "device": device(),
-        "task": f"`{json.dumps(asdict(config.env))}`",
-        "motion": f"`{json.dumps(asdict(config.motion))}`",
+        "policies": "; ".join(policies) or "none",
+        "task": json.dumps(asdict(config.env)),
+        "motion": json.dumps(asdict(config.motion)),
         "episodes": f"{config.episodes} a sea, seed {config.seed}; the first second is not counted",
         "not here": "a sweep over measurement noise: python -m mcx_jax.evaluate has none yet",
     }

@@ -117,8 +117,10 @@ def lag_s(goal_m: np.ndarray, follower_m: np.ndarray) -> float:
 
     Args:
         goal_m, follower_m: (steps, 3) at the control rate. A constant distance (the arm sags) does
-            not count. Resolution 1 ms.
+            not count. Resolution 1 ms; NaN if the episode diverged.
     """
+    if not np.isfinite(follower_m).all():
+        return np.nan
     time_s = CONTROL_DT_S * np.arange(len(goal_m))
     shifts = np.arange(LAG_RANGE_S[0], min(LAG_RANGE_S[1], 0.5 * time_s[-1]), 0.001)
     inside = (time_s >= shifts[-1]) & (time_s <= time_s[-1] + shifts[0])

@@ -182,7 +182,7 @@ def follow(
     axes.set_ylabel(ylabel)
     axes.set_xlim(time_s[0], time_s[-1])
     start, end, level = late
-    if abs(end - start) > 0.012 * (time_s[-1] - time_s[0]):
+    if abs(end - start) > 0.02 * (time_s[-1] - time_s[0]):  # else the arrow is its head
         axes.annotate(
             f"{1e3 * (end - start):.0f} ms",
             (max(start, end), level),

@@ -8,6 +8,8 @@ from pathlib import Path
 from mcx_jax.report.sections import Section
 
 STYLE = Path(__file__).with_name("page.css")
+CODE = ("command", "task", "motion")
+"""Facts that are code."""
 
 
 def page(
@@ -23,7 +25,7 @@ def page(
     Args:
         lead: sentences that say the result.
         pngs: of every panel of the sections, by name.
-        facts: how the numbers were made; a value in backquotes is code.
+        facts: how the numbers were made.
     """
     head = (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -36,7 +38,7 @@ def page(
         body.append(f'<div class="lead">{sentences}</div>')
     body.append("</header><main>")
     body += [_section(section, pngs) for section in sections]
-    items = "".join(f"<dt>{escape(k)}</dt><dd>{_value(v)}</dd>" for k, v in facts.items())
+    items = "".join(f"<dt>{escape(k)}</dt><dd>{_value(k, v)}</dd>" for k, v in facts.items())
     body.append(f"<section><h2>How it was made</h2><dl>{items}</dl></section></main>")
     return f"{head}\n<body>{chr(10).join(body)}</body></html>\n"
 
@@ -54,7 +56,5 @@ def _section(section: Section, pngs: Mapping[str, bytes]) -> str:
     )
 
 
-def _value(text: str) -> str:
-    if text.startswith("`") and text.endswith("`"):
-        return f"<code>{escape(text[1:-1])}</code>"
-    return escape(text)
+def _value(name: str, text: str) -> str:
+    return f"<code>{escape(text)}</code>" if name in CODE else escape(text)

@@ -69,7 +69,7 @@ def distributions(parts: Sequence[tuple[str, bool, Errors]]) -> Section:
         f"All points of {episodes} test episodes a sea after the first second, the same motion and "
         "goals for everyone. Box: the middle half of the points; line in it: median; whiskers: 5 % "
         "to 95 %; dot and number: mean; open diamond: the paper's mean (table 3; for ik the "
-        "baseline that it implies). The figure is the paper's figure 4, with more controllers.",
+        "baseline that it implies). Figure 4 of the paper shows its baseline's errors in this way.",
     )
 
 
@@ -77,7 +77,7 @@ def tracking(
     ik: Episode, others: Sequence[tuple[str, Episode]], colours: dict[str, str], where: str
 ) -> Section:
     """One episode: how late the tool is, and the errors over time."""
-    warm = slice(WARM_UP_STEPS, None)
+    warm = slice(min(WARM_UP_STEPS, len(ik.time_s) // 3), None)  # a lag needs half a second
     axis = int(np.argmax(ik.goal_m[warm].std(axis=0)))
     window = _steepest(ik.time_s, ik.goal_m[:, axis])
     panels, lags = [], []
@@ -244,9 +244,7 @@ def sea_spectra(spectra: Sequence[Spectrum]) -> Section:
     if spectra[0].target_hz.size:
         caption += (
             "Dashed: the target, JONSWAP's wave spectrum times the square of the vessel's linear "
-            f"response (RAO). {_agreement(spectra)} Left and right of the response that was "
-            "solved for (dashed) there are no waves: what is drawn there is leakage of the "
-            "estimate."
+            f"response (RAO). {_agreement(spectra)}"
         )
     else:
         caption += "A recording has no target spectrum."
@@ -256,7 +254,10 @@ def sea_spectra(spectra: Sequence[Spectrum]) -> Section:
 def _agreement(spectra: Sequence[Spectrum]) -> str:
     ratio = np.array([s.measured_std / s.target_std for s in spectra])
     worst = 100.0 * float(np.abs(ratio - 1.0).max())
-    return f"The standard deviations of all motions and seas agree with it within {worst:.2g} %."
+    return (
+        f"The standard deviations of all motions and seas agree with it within {worst:.2g} %: only "
+        "the phases of the generated waves are random, not their amplitudes."
+    )
 
 
 def lead(rows: dict[str, list[dict[str, Any]]], learned: Sequence[str]) -> list[str]:

@@ -91,6 +91,7 @@ def label_right(
     """
     height_pt = figure.get_size_inches()[1] * 72 * 0.75  # of the axes, roughly
     transform = axes.transScale + axes.transLimits
+    labels = [label for label in labels if np.isfinite(label[2])]
     at = [float(transform.transform((axes.get_xlim()[0], y))[1]) for _, _, y in labels]
     places = spread(at, 1.15 * size / height_pt)
     for (text, colour, _), place in zip(labels, places, strict=True):
