@@ -110,10 +110,10 @@ def _pale(colour: str) -> tuple[float, ...]:
 
 
 def _plain_log(axis) -> None:
-    """0.1, 1, 10 instead of powers; 2 and 5 as well where there are few of them."""
+    """0.1, 1, 10 instead of powers, and steps between them where there are few."""
     low, high = axis.get_view_interval()
-    many = high / low > 300
-    subs = (1.0,) if many else (1.0, 2.0, 5.0)
+    ratio = high / low
+    subs = (1.0,) if ratio > 300 else (1.0, 2.0, 5.0) if ratio > 8 else (1.0, 1.5, 2, 3, 4, 6, 8)
     axis.get_major_locator().set_params(subs=subs)
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())

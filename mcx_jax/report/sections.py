@@ -175,7 +175,8 @@ def effort(
         "inverse kinematics gets (ik: nothing). Torque: magnitude of what a joint's servos give "
         "together, as a share of their force limits, at the end of every control step after the "
         "first second; boxes as above. With the Euler integrator the stiff servo chatters at "
-        "500 Hz, which is part of what one sees.",
+        "500 Hz, which is part of what one sees; a joint's two servos can also pull against each "
+        "other and give nothing together.",
     )
 
 
