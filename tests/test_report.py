@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import subprocess
+import sys
 from html.parser import HTMLParser
 
 import jax
@@ -14,17 +15,20 @@ import pytest
 from mcx_jax import cli
 from mcx_jax.config import EnvConfig, MotionConfig, TrainConfig
 from mcx_jax.errors import UserError
-from mcx_jax.evaluate import evaluate_beside_ik, load_controller
+from mcx_jax.evaluate import (
+    errors_beside_ik,
+    evaluate_beside_ik,
+    evaluation_env,
+    load_controller,
+)
 from mcx_jax.paper import table3
 from mcx_jax.policy import Policy, PolicyMeta, save_policy
 from mcx_jax.ppo.networks import init_params
 from mcx_jax.ppo.normalise import init_stats
 from mcx_jax.report import entries, style
-from mcx_jax.report.__main__ import main
-from mcx_jax.report.episode import lag_s, torque_limits_nm
+from mcx_jax.report.__main__ import check_out, main
+from mcx_jax.report.episode import lag_s, record, torque_limits_nm
 from mcx_jax.report.spectra import motion_spectra
-
-pytest.importorskip("matplotlib")
 
 STEPS, EPISODES, SEED = 90, 2, 3
 # The quiet integrator, so that rounding stays rounding.
@@ -139,6 +143,24 @@ def test_table_has_evaluates_numbers(made, html):
         assert f"{paper[f'{name}_mean']:.2f} ± {paper[f'{name}_std']:.2f}" in cells
 
 
+def test_recorded_episode_is_evaluates(made):
+    _, run = made
+    who, controller = load_controller(str(run))
+    env = evaluation_env(TASK, MotionConfig(sea="Wb"))
+    both = errors_beside_ik(who, controller, env, episodes=EPISODES, seed=SEED)
+    series = record(env, controller, episode=0, episodes=EPISODES, seed=SEED, sea=0)
+    for errors, episode in zip(both, series, strict=True):
+        np.testing.assert_allclose(episode.pos_error_m, errors.pos_m[:, 0, 0], atol=2e-5)
+        np.testing.assert_allclose(episode.ang_error_rad, errors.ang_rad[:, 0, 0], atol=2e-5)
+        apart = np.linalg.norm(episode.goal_m - episode.tool_m, axis=1)
+        np.testing.assert_allclose(apart, episode.pos_error_m, atol=2e-6)
+        assert np.all(np.abs(episode.torque_nm) <= torque_limits_nm(env.model) * (1 + 1e-6))
+    assert not series[0].correction.any() and series[1].correction.any()
+    # The queue of two steps, seen from outside: 40 ms, half a hold and the servo.
+    lag = lag_s(series[0].goal_m[30:], series[0].tool_m[30:])
+    assert 0.04 < lag < 0.07, lag
+
+
 def test_written_again_over_an_earlier_report_only(made, tmp_path):
     out, run = made
     other = tmp_path / "mine"
@@ -149,8 +171,6 @@ def test_written_again_over_an_earlier_report_only(made, tmp_path):
         f"--out {other}: holds other files; name a new or an empty directory",
     )
     assert [path.name for path in other.iterdir()] == ["notes.txt"]
-    from mcx_jax.report.__main__ import check_out
-
     assert check_out(str(out)) == out
 
 
@@ -176,6 +196,7 @@ def test_refusals(made, tmp_path):
     file = tmp_path / "file"
     file.write_text("")
     refused(["ik", "--out", str(file)], f"--out {file}: is a file; name a directory")
+    refused(["ik", "--out", f"{file}/out"], f"--out {file}/out: cannot write in {file}")
     refused(["ik", "--out", out, "--show", "50"], "--show 50: must be 0 to 49 (--episodes)")
     other = make_run(tmp_path / "E0-tiny-s0", dataclasses.replace(TASK, delay="E0"))
     refused(
@@ -189,8 +210,6 @@ def test_refusals(made, tmp_path):
 
 
 def test_without_matplotlib_one_clear_line(made, tmp_path, monkeypatch):
-    import sys
-
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     refused(
         [str(made[1]), "--out", str(tmp_path / "out")],
@@ -270,7 +289,7 @@ def test_a_browser_shows_it(made, tmp_path, width_px):
     options = ["--headless", "--no-sandbox", "--disable-gpu", f"--window-size={width_px},900"]
     options += [f"--user-data-dir={tmp_path / 'profile'}", "--enable-logging=stderr", "--dump-dom"]
     done = subprocess.run(
-        [browser, *options, page.as_uri()], capture_output=True, text=True, timeout=60, check=False
+        [browser, *options, page.as_uri()], capture_output=True, text=True, timeout=120, check=False
     )
     if done.returncode:
         pytest.skip(f"{browser} does not start here: {done.stderr[-300:]}")

@@ -5,10 +5,11 @@ RUN is ik, extrapolate, preview, a run directory or a policy file; ik is always 
 
 import dataclasses
 import json
+import os
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
@@ -24,7 +25,7 @@ KIND = "mcx_jax report"
 class ReportConfig:
     """One self-contained HTML page about controllers, and its figures as PNG files beside it."""
 
-    runs: tyro.conf.Positional[tuple[str, ...]] = ()
+    runs: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="RUN ...")] = ()
     """Any of ik, extrapolate, preview, run directories and policy .npz files."""
     out: str = ""
     """Directory to write to: a new one, an empty one, or an earlier report's."""
@@ -58,6 +59,10 @@ def check_out(out: str) -> Path:
         raise UserError(f"--out {out}: is a file; name a directory")
     if path.is_dir() and any(path.iterdir()) and not _is_report(path):
         raise UserError(f"--out {out}: holds other files; name a new or an empty directory")
+    # Before minutes of evaluation, not after.
+    parent = next(p for p in (path, *path.absolute().parents) if p.exists())
+    if not parent.is_dir() or not os.access(parent, os.W_OK):
+        raise UserError(f"--out {out}: cannot write in {parent}")
     return path
 
 
