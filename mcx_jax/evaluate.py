@@ -103,6 +103,57 @@ def episode_errors(env, controller, gains: tuple[float, ...], episodes: int, see
     return dp.reshape(-1, *shape), da.reshape(-1, *shape), valid.reshape(shape)
 
 
+@dataclass(frozen=True)
+class Errors:
+    """Errors of whole test episodes of one controller, NumPy."""
+
+    who: str
+    delay: str
+    seas: tuple[str, ...]
+    pos_m: Any
+    """dp (steps, seas, episodes)."""
+    ang_rad: Any
+    """da (steps, seas, episodes)."""
+    valid: Any
+    """(seas, episodes) bool."""
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One result row a sea (without the improvement)."""
+        from mcx_jax.results import row
+
+        return [
+            row(self.who, self.delay, sea, self.pos_m[:, i], self.ang_rad[:, i], self.valid[i])
+            for i, sea in enumerate(self.seas)
+        ]
+
+
+def evaluation_env(env_config: EnvConfig, motion_config: MotionConfig):
+    """The task on test motion.
+
+    Raises:
+        UserError: episodes that end within the warm-up.
+    """
+    from mcx_jax.envs.v2v import make_env
+    from mcx_jax.results import WARM_UP_STEPS
+
+    if env_config.episode_steps <= WARM_UP_STEPS:
+        raise UserError(
+            f"--episode-steps {env_config.episode_steps}: the first {WARM_UP_STEPS} steps are not "
+            f"counted; evaluate at least {WARM_UP_STEPS + 1}"
+        )
+    return make_env(env_config, motion_config, split="test")
+
+
+def errors_beside_ik(who: str, controller: Any, env, *, episodes: int, seed: int) -> list[Errors]:
+    """Errors of the IK baseline and of a controller on the same episodes; `ik` runs alone."""
+    names = ("ik",) if who == "ik" else ("ik", who)
+    dp, da, valid = episode_errors(env, controller, (0.0, 1.0)[: len(names)], episodes, seed)
+    return [
+        Errors(name, env.delay.name, env.motion.seas, dp[:, k], da[:, k], valid[k])
+        for k, name in enumerate(names)
+    ]
+
+
 def evaluate_beside_ik(
     who: str,
     controller: Any,
@@ -126,24 +177,17 @@ def evaluate_beside_ik(
     Raises:
         UserError: episodes that end within the warm-up.
     """
-    from mcx_jax.envs.v2v import make_env
-    from mcx_jax.results import WARM_UP_STEPS, add_improvement, row
+    env = evaluation_env(env_config, motion_config)
+    return rows_beside_ik(errors_beside_ik(who, controller, env, episodes=episodes, seed=seed))
 
-    if env_config.episode_steps <= WARM_UP_STEPS:
-        raise UserError(
-            f"--episode-steps {env_config.episode_steps}: the first {WARM_UP_STEPS} steps are not "
-            f"counted; evaluate at least {WARM_UP_STEPS + 1}"
-        )
-    env = make_env(env_config, motion_config, split="test")
-    names = ("ik",) if who == "ik" else ("ik", who)
-    dp, da, valid = episode_errors(env, controller, (0.0, 1.0)[: len(names)], episodes, seed)
-    rows = [
-        [
-            row(name, env_config.delay, sea, dp[:, k, i], da[:, k, i], valid[k, i])
-            for i, sea in enumerate(env.motion.seas)
-        ]
-        for k, name in enumerate(names)
-    ]
+
+def rows_beside_ik(
+    errors: list[Errors],
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """(rows of ik, rows of the other) with the improvement over ik, from `errors_beside_ik`."""
+    from mcx_jax.results import add_improvement
+
+    rows = [part.rows() for part in errors]
     for part in rows:
         add_improvement(part, rows[0])
     return rows[0], rows[-1]
@@ -192,20 +236,31 @@ def print_table(rows: list[dict[str, Any]], file=None) -> None:
     Console(file=file, width=None if (file or sys.stdout).isatty() else 150).print(table)
 
 
-def load_controller(who: str) -> tuple[str, Any]:
-    """(name, controller) for a name, a run directory or a policy file."""
-    from mcx_jax.controllers import CLASSICAL
+def policy_path(who: str) -> Path | None:
+    """The policy file of a run directory or a policy file; None for a controller's name.
 
-    if who in CLASSICAL:
-        return who, CLASSICAL[who]
+    Needs no JAX, so that a mistyped name is told at once.
+    """
+    if who in WHO:
+        return None
     path = Path(who)
     if not path.exists():
         raise UserError(
             f"unknown controller '{who}': use {', '.join(WHO)}, a run directory or a policy .npz"
         )
-    from mcx_jax.policy import PolicyController, load_run
+    return path / "policy.npz" if path.is_dir() else path
 
-    return who.rstrip("/"), PolicyController(load_run(path))
+
+def load_controller(who: str) -> tuple[str, Any]:
+    """(name, controller) for a name, a run directory or a policy file."""
+    path = policy_path(who)
+    if path is None:
+        from mcx_jax.controllers import CLASSICAL
+
+        return who, CLASSICAL[who]
+    from mcx_jax.policy import PolicyController, load_policy
+
+    return who.rstrip("/"), PolicyController(load_policy(path))
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -52,7 +52,7 @@ def row(
     Raises:
         UserError: no episode has finite errors.
     """
-    finite = np.isfinite(pos_m).all(axis=0) & np.isfinite(ang_rad).all(axis=0)
+    finite = finite_episodes(pos_m, ang_rad)
     if not finite.any():
         raise UserError(f"{who}, {delay}, {sea}: every episode diverged: nothing to report")
     return {
@@ -64,6 +64,11 @@ def row(
         "pos_mm": error_statistics(1e3 * pos_m[WARM_UP_STEPS:, finite]),
         "ang_mrad": error_statistics(1e3 * ang_rad[WARM_UP_STEPS:, finite]),
     }
+
+
+def finite_episodes(pos_m: np.ndarray, ang_rad: np.ndarray) -> np.ndarray:
+    """(episodes,) bool: which of (steps, episodes) have no number that is not finite."""
+    return np.asarray(np.isfinite(pos_m).all(axis=0) & np.isfinite(ang_rad).all(axis=0))
 
 
 def add_improvement(rows: list[dict[str, Any]], baseline: list[dict[str, Any]]) -> None:

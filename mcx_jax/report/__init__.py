@@ -1,0 +1,1 @@
+"""`python -m mcx_jax.report RUN... --out DIR`: evaluation result -> arrays -> figures -> page."""

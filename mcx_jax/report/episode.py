@@ -1,0 +1,133 @@
+"""One episode with everything that the error statistics leave out: positions, references, torques.
+
+The environment's public functions in one compiled program; baseline and controller side by side.
+"""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from mcx_jax.config import CONTROL_DT_S
+from mcx_jax.envs import chain, ik
+from mcx_jax.envs.model import ChainModel
+from mcx_jax.envs.v2v import EnvState, V2VEnv, command
+from mcx_jax.spatial import unpack
+
+
+@struct.dataclass
+class Episode:
+    """Time series of one episode; axis 0 = end of control step 1, 2, ... Positions in frame B."""
+
+    goal_m: Any
+    """(steps, 3) goal."""
+    reference_m: Any
+    """(steps, 3) where the tool would be if the arm followed its late reference at once."""
+    tool_m: Any
+    """(steps, 3) tool."""
+    pos_error_m: Any
+    """(steps,) dp."""
+    ang_error_rad: Any
+    """(steps,) da."""
+    correction: Any
+    """(steps, 6) action of the control step, cm and crad in the goal's axes."""
+    torque_nm: Any
+    """(steps, nq) joint torque of the servos at the end of the control step."""
+
+    @property
+    def time_s(self) -> np.ndarray:
+        """(steps,) end of each control step."""
+        return CONTROL_DT_S * np.arange(1, len(self.pos_error_m) + 1)
+
+
+def record(
+    env: V2VEnv, controller: Any, *, episode: int, episodes: int, seed: int, sea: int
+) -> tuple[Episode, Episode]:
+    """(IK baseline, controller) over one of the episodes that `evaluate` runs with this seed.
+
+    Args:
+        episode: which of the sea's `episodes`.
+        sea: index into env.motion.seas.
+    """
+    key = jax.random.split(jax.random.key(seed), episodes)[episode]
+    gains = jnp.asarray([0.0, 1.0])
+    series = jax.device_get(_compiled()(env, controller, key, jnp.int32(sea), gains))
+    ours = [jax.tree.map(lambda x, k=k: x[..., k], series) for k in range(2)]
+    return ours[0], ours[1]
+
+
+@functools.cache
+def _compiled():
+    return jax.jit(_roll_out)
+
+
+def _roll_out(env: V2VEnv, controller: Any, key, sea, gains) -> Episode:
+    """The same episode for each factor of the actions, batch axis last."""
+    batched = functools.partial(jax.vmap, in_axes=-1, out_axes=-1)
+    state = jax.vmap(lambda _: env.reset(key, sea), out_axes=-1)(gains)
+    memory = batched(functools.partial(controller.init, env))(state)
+    act, step = batched(functools.partial(controller.act, env)), batched(env.step)
+
+    def body(carry, _):
+        state, memory = carry
+        memory, action = act(state, memory)
+        action = gains * action
+        after = step(state, action)
+        return (after, memory), batched(functools.partial(_sample, env))(state, after, action)
+
+    return jax.lax.scan(body, (state, memory), None, env.episode_steps)[1]
+
+
+def _sample(env: V2VEnv, before: EnvState, after: EnvState, action: jax.Array) -> Episode:
+    model = env.model
+    angles = unpack(after.arm.q, model.nq)
+    # As `step` gives it to the servos.
+    rate = jnp.where(before.step == 0, 0.0, (after.reference - before.reference) / CONTROL_DT_S)
+    ctrl = command(model, after.reference, rate)
+    rates, commands = unpack(after.arm.qd, model.nq), unpack(ctrl, len(model.actuators))
+    return Episode(
+        goal_m=after.goal_position,
+        reference_m=jnp.stack(ik.tool_pose(model, unpack(after.reference, model.nq))[1]),
+        tool_m=jnp.stack(ik.tool_pose(model, angles)[1]),
+        pos_error_m=after.metrics.pos_error_m,
+        ang_error_rad=after.metrics.ang_error_rad,
+        correction=action,
+        torque_nm=jnp.stack(chain.actuate(model, angles, rates, commands)[0]),
+    )
+
+
+def torque_limits_nm(model: ChainModel) -> np.ndarray:
+    """(nq,) most that a joint's actuators give together; infinite where one has no limit."""
+    limits = np.zeros(model.nq)
+    for act in model.actuators:
+        most = max(map(abs, act.force_range)) if act.force_range else np.inf
+        limits[act.joint] += abs(act.gear) * most
+    return limits
+
+
+LAG_RANGE_S = (-0.2, 1.2)
+"""Where a lag is looked for: longer than every delay that the command line accepts."""
+
+
+def lag_s(goal_m: np.ndarray, follower_m: np.ndarray) -> float:
+    """By how much a track follows another late: the shift with the least mean square distance.
+
+    Args:
+        goal_m, follower_m: (steps, 3) at the control rate. A constant distance (the arm sags) does
+            not count. Resolution 1 ms; NaN if the episode diverged.
+    """
+    if not np.isfinite(follower_m).all():
+        return np.nan
+    time_s = CONTROL_DT_S * np.arange(len(goal_m))
+    shifts = np.arange(LAG_RANGE_S[0], min(LAG_RANGE_S[1], 0.5 * time_s[-1]), 0.001)
+    inside = (time_s >= shifts[-1]) & (time_s <= time_s[-1] + shifts[0])
+
+    def distance(shift: float) -> float:
+        late = [np.interp(time_s[inside] - shift, time_s, axis) for axis in goal_m.T]
+        apart = np.stack(late, 1) - follower_m[inside]
+        return float(np.square(apart - apart.mean(axis=0)).mean())
+
+    return float(shifts[int(np.argmin([distance(shift) for shift in shifts]))])

@@ -1,0 +1,298 @@
+"""The report: one page that needs nothing else, with evaluate's numbers and every figure."""
+
+import dataclasses
+import json
+import re
+import shutil
+import subprocess
+import sys
+from html.parser import HTMLParser
+
+import jax
+import numpy as np
+import pytest
+
+from mcx_jax import cli
+from mcx_jax.config import EnvConfig, MotionConfig, TrainConfig
+from mcx_jax.errors import UserError
+from mcx_jax.evaluate import (
+    errors_beside_ik,
+    evaluate_beside_ik,
+    evaluation_env,
+    load_controller,
+)
+from mcx_jax.paper import table3
+from mcx_jax.policy import Policy, PolicyMeta, save_policy
+from mcx_jax.ppo.networks import init_params
+from mcx_jax.ppo.normalise import init_stats
+from mcx_jax.report import entries, style
+from mcx_jax.report.__main__ import check_out, main
+from mcx_jax.report.episode import lag_s, record, torque_limits_nm
+from mcx_jax.report.spectra import motion_spectra
+
+STEPS, EPISODES, SEED = 90, 2, 3
+# The quiet integrator, so that rounding stays rounding.
+TASK = EnvConfig(delay="E2", integrator="implicitfast", episode_steps=STEPS)
+OPTIONS = ["--episodes", str(EPISODES), "--episode-steps", str(STEPS), "--seed", str(SEED)]
+
+
+def make_run(path, env=TASK, seeds=2):
+    """A run directory with an untrained policy and made-up metrics of two iterations."""
+    path.mkdir(parents=True)
+    text = cli.config_to_json(
+        TrainConfig(seeds=seeds, env=dataclasses.replace(env, episode_steps=1024))
+    )
+    meta = PolicyMeta(obs_size=38, action_size=6, hidden=8, config=text)
+    policy = Policy(init_params(meta.net, jax.random.key(0), 38), init_stats((38,)), meta)
+    save_policy(path / "policy.npz", policy)
+    rows = [
+        {"iteration": i, "steps": 1000 * i, "seed": k, "pos_error_mm": 8.0 / i + k}
+        | {"ang_error_mrad": 4.0 / i + k, "wall_s": 60.0 * i}
+        for i in (1, 2)
+        for k in range(seeds)
+    ]
+    lines = [json.dumps(row) + "\n" for row in rows]
+    (path / "metrics.jsonl").write_text("".join(lines) + '{"iteration": 3, "st')
+    return path
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """(report directory, run directory): a run beside ik in two kinds of section."""
+    folder = tmp_path_factory.mktemp("report")
+    run = make_run(folder / "runs" / "E2-tiny-s0")
+    main([str(run), "--out", str(folder / "out"), "--sea", "Wb", *OPTIONS])
+    return folder / "out", run
+
+
+class Page(HTMLParser):
+    """What the tests look at."""
+
+    VOID = ("meta", "img", "br", "hr", "link", "input")
+
+    def __init__(self, text):
+        super().__init__(convert_charrefs=True)
+        self.open, self.tags, self.images, self.cells, self.text = [], [], [], [], ""
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        if tag == "img":
+            self.images.append(dict(attrs))
+        if tag in ("td", "th"):
+            self.cells.append("")
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag, (tag, self.getpos())
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] in ("td", "th"):
+            self.cells[-1] += data
+        self.text += data
+
+
+@pytest.fixture(scope="module")
+def html(made):
+    return (made[0] / "index.html").read_text(encoding="utf-8")
+
+
+def test_page_parses_and_holds_every_figure(made, html):
+    page = Page(html)
+    assert page.open == []
+    out = made[0]
+    pngs = sorted(path.name for path in out.glob("*.png"))
+    wanted = ("errors_dp", "errors_da", "follow_0", "follow_1", "episode_dp", "episode_da")
+    wanted += ("correction_translation", "correction_rotation", "torque")
+    wanted += tuple(f"learning_{e}_{x}" for e in ("dp", "da") for x in ("steps", "wall"))
+    wanted += tuple(f"spectrum_{c}" for c in ("surge", "sway", "heave", "roll", "pitch", "yaw"))
+    assert pngs == sorted(f"{name}.png" for name in wanted)
+    assert len(page.images) == len(pngs)
+    assert all(i["src"].startswith("data:image/png;base64,iVBOR") and i["alt"] for i in page.images)
+    for said in ("python -m mcx_jax.report", "jax", "matplotlib", "CPU cores", '"delay": "E2"'):
+        assert said in page.text, said
+
+
+def test_nothing_comes_from_outside(html):
+    page = Page(html)
+    assert "://" not in re.sub(r"base64,[\w+/=]+", "", html)
+    assert not {tag for tag, _ in page.tags} & {"script", "link", "iframe", "object", "base"}
+    assert "@import" not in html and "url(" not in html
+    assert all(a.get("src", "data:").startswith("data:") and "href" not in a for _, a in page.tags)
+
+
+def test_table_has_evaluates_numbers(made, html):
+    out, run = made
+    who, controller = load_controller(str(run))
+    both = evaluate_beside_ik(
+        who, controller, TASK, MotionConfig(sea="Wb"), episodes=EPISODES, seed=SEED
+    )
+    stored = json.loads((out / "results.json").read_text())
+    assert stored["rows"] == [row for part in both for row in part]
+    cells = Page(html).cells
+    for (row,) in both:
+        for unit in ("pos_mm", "ang_mrad"):
+            assert f"{row[unit]['mean']:.2f} ± {row[unit]['std']:.2f}" in cells
+    for group in ("all", "top5", "top1", "max"):
+        assert f"{100 * both[1][0]['improvement']['pos'][group]:.0f}" in cells
+    paper = table3()["E2", "Wb"]
+    for name in ("pos_mm", "ang_mrad"):
+        assert f"{paper[f'ik_{name}_implied']:.2f}" in cells
+        assert f"{paper[f'{name}_mean']:.2f} ± {paper[f'{name}_std']:.2f}" in cells
+
+
+def test_recorded_episode_is_evaluates(made):
+    _, run = made
+    who, controller = load_controller(str(run))
+    env = evaluation_env(TASK, MotionConfig(sea="Wb"))
+    both = errors_beside_ik(who, controller, env, episodes=EPISODES, seed=SEED)
+    series = record(env, controller, episode=0, episodes=EPISODES, seed=SEED, sea=0)
+    for errors, episode in zip(both, series, strict=True):
+        np.testing.assert_allclose(episode.pos_error_m, errors.pos_m[:, 0, 0], atol=2e-5)
+        np.testing.assert_allclose(episode.ang_error_rad, errors.ang_rad[:, 0, 0], atol=2e-5)
+        apart = np.linalg.norm(episode.goal_m - episode.tool_m, axis=1)
+        np.testing.assert_allclose(apart, episode.pos_error_m, atol=2e-6)
+        assert np.all(np.abs(episode.torque_nm) <= torque_limits_nm(env.model) * (1 + 1e-6))
+    assert not series[0].correction.any() and series[1].correction.any()
+    # The queue of two steps, seen from outside: 40 ms, half a hold and the servo.
+    lag = lag_s(series[0].goal_m[30:], series[0].tool_m[30:])
+    assert 0.04 < lag < 0.07, lag
+
+
+def test_written_again_over_an_earlier_report_only(made, tmp_path):
+    out, run = made
+    other = tmp_path / "mine"
+    other.mkdir()
+    (other / "notes.txt").write_text("mine")
+    refused(
+        [str(run), "--out", str(other)],
+        f"--out {other}: holds other files; name a new or an empty directory",
+    )
+    assert [path.name for path in other.iterdir()] == ["notes.txt"]
+    assert check_out(str(out)) == out
+
+
+def refused(argv, message):
+    with pytest.raises(UserError) as error:
+        main(argv)
+    assert str(error.value) == message
+
+
+def test_refusals(made, tmp_path):
+    _, run = made
+    out = str(tmp_path / "out")
+    refused(
+        ["nobody", "--out", out],
+        "unknown controller 'nobody': use ik, extrapolate, preview, a run directory or a policy "
+        ".npz",
+    )
+    refused(
+        ["--out", out],
+        "name at least one RUN: ik, extrapolate, preview, a run directory or .npz",
+    )
+    refused(["ik"], "--out is missing: name a directory for the report")
+    file = tmp_path / "file"
+    file.write_text("")
+    refused(["ik", "--out", str(file)], f"--out {file}: is a file; name a directory")
+    refused(["ik", "--out", f"{file}/out"], f"--out {file}/out: cannot write in {file}")
+    refused(["ik", "--out", out, "--show", "50"], "--show 50: must be 0 to 49 (--episodes)")
+    other = make_run(tmp_path / "E0-tiny-s0", dataclasses.replace(TASK, delay="E0"))
+    refused(
+        [str(run), str(other), "--out", out],
+        "the runs differ in --delay (E2-tiny-s0 E2, E0-tiny-s0 E0); choose one with --delay",
+    )
+    assert not (tmp_path / "out").exists()
+    both = entries.load_entries(entries.check_names([str(run), str(other)]))
+    chosen = entries.common_settings(both, ["--delay", "E1"])
+    assert chosen["integrator"] == "implicitfast"
+
+
+def test_without_matplotlib_one_clear_line(made, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    refused(
+        [str(made[1]), "--out", str(tmp_path / "out")],
+        "the report needs matplotlib: pip install 'mcx_jax[viz]'",
+    )
+
+
+def test_learning_curves_over_seeds(made):
+    curves = entries.learning_curves(made[1])
+    assert curves is not None
+    np.testing.assert_array_equal(curves.steps, [1000, 2000])
+    np.testing.assert_array_equal(curves.wall_s, [60, 120])
+    np.testing.assert_array_equal(curves.pos_mm, [[8, 4], [9, 5]])
+    np.testing.assert_array_equal(curves.ang_mrad, [[4, 2], [5, 3]])
+
+
+def test_a_known_delay_is_found():
+    t = 0.02 * np.arange(500)
+    track = lambda t: np.stack([np.sin(1.7 * t), np.sin(2.9 * t), np.cos(0.8 * t)], 1)  # noqa: E731
+    assert lag_s(track(t), 0.01 + track(t - 0.037)) == pytest.approx(0.037, abs=0.0015)
+    assert lag_s(track(t), track(t + 0.015)) == pytest.approx(-0.015, abs=0.0015)
+
+
+def test_torque_limits_add_over_a_joints_actuators():
+    from mcx_jax.envs.model import chain_model, load_mujoco
+
+    # Two servos a joint, each +-330, 330, 150, 56, 56, 56 N m (authors' code).
+    limits = torque_limits_nm(chain_model(load_mujoco("paper"), "tool"))
+    np.testing.assert_allclose(limits, [660, 660, 300, 112, 112, 112])
+
+
+def test_spectra_of_the_tables_are_the_target():
+    from mcx_jax.sea.spectrum import parse_sea
+    from mcx_jax.sea.tables import build_tables
+
+    knots = build_tables([parse_sea("Wa"), parse_sea("2.0:9")], "test").knots
+    for s in motion_spectra(knots, ("Wa", "2.0:9"), generated=True):
+        np.testing.assert_allclose(s.measured_std, s.target_std, rtol=0.01)
+        inside = (s.frequency_hz > 0.25) & (s.frequency_hz < 0.8)
+        wanted = np.stack([np.interp(s.frequency_hz[inside], s.target_hz, x) for x in s.target])
+        strong = wanted > 0.05 * wanted.max(axis=1, keepdims=True)
+        ratio = (s.measured[:, inside] / wanted)[strong]
+        assert abs(np.median(ratio) - 1) < 0.05 and np.all((ratio > 0.4) & (ratio < 2)), ratio
+
+
+@pytest.mark.parametrize(
+    ("places", "moved"),
+    [
+        ([0.1, 0.9], [0.1, 0.9]),
+        ([0.5, 0.5], [0.4, 0.6]),
+        ([0.8, 0.1, 0.85], [0.725, 0.1, 0.925]),
+        ([0.5, 0.5, 0.5, 0.0], [0.3, 0.5, 0.7, 0.0]),
+    ],
+)
+def test_labels_moved_apart(places, moved):
+    assert style.spread(places, 0.2) == pytest.approx(moved)
+
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+
+
+@pytest.mark.parametrize("width_px", [500, 1200])
+def test_a_browser_shows_it(made, tmp_path, width_px):
+    """Chromium, if there is one: every image drawn, nothing wider than the window, no complaint."""
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        pytest.skip(f"no browser here (looked for {', '.join(BROWSERS)})")
+    probe = (
+        "<script>const root = document.documentElement;"
+        "addEventListener('load', () => { document.title = JSON.stringify({"
+        "images: [...document.images].filter(i => i.complete && i.naturalWidth > 0).length,"
+        "over: root.scrollWidth - root.clientWidth}) })</script></body>"
+    )
+    page = tmp_path / "page.html"
+    text = (made[0] / "index.html").read_text(encoding="utf-8")
+    page.write_text(text.replace("</body>", probe), encoding="utf-8")
+    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--window-size={width_px},900"]
+    options += [f"--user-data-dir={tmp_path / 'profile'}", "--enable-logging=stderr", "--dump-dom"]
+    done = subprocess.run(
+        [browser, *options, page.as_uri()], capture_output=True, text=True, timeout=120, check=False
+    )
+    if done.returncode:
+        pytest.skip(f"{browser} does not start here: {done.stderr[-300:]}")
+    shown = json.loads(re.search(r"<title>(.*?)</title>", done.stdout)[1])
+    assert shown == {"images": len(list(made[0].glob("*.png"))), "over": 0}
+    assert "CONSOLE" not in done.stderr, done.stderr
