@@ -13,7 +13,7 @@ VENV := .venv
 PY   := $(VENV)/bin/python
 PIP  := $(PY) -m pip install --disable-pip-version-check --progress-bar off -c constraints.txt
 
-.PHONY: help train test check format clean
+.PHONY: help train bench test check format clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -24,6 +24,9 @@ help:  ## this list
 
 train: $(VENV)/.run  ## train an agent for DELAY, ending with its table beside baseline and paper
 	$(PY) -m mcx_jax.train --delay $(DELAY) --num-envs $(NUM_ENVS) $(ARGS)
+
+bench: $(VENV)/.run  ## how fast everything is here, rivals included; let nothing else run
+	$(PY) -m mcx_jax.bench $(ARGS)
 
 test: check  ## lint, format, types, then all tests, cheap ones first
 	$(PY) -m pytest $(ARGS)

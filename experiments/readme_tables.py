@@ -112,6 +112,44 @@ def controllers() -> str:
     return markdown(["B4_4", *SEAS], rows) + "\n\nSource: " + commands
 
 
+def speed() -> str:
+    """What the bench measured."""
+    stored = read("speed")
+    if not stored:
+        return "not measured yet (`python experiments/speed.py`)"
+    one = {r["what"]: float(r["value"]) for r in stored if not r["envs"]}
+    at = {(r["what"], int(r["envs"])): float(r["value"]) for r in stored if r["envs"]}
+
+    def best(engine: str) -> str:
+        cells = {n: v for (what, n), v in at.items() if what == f"physics {engine}"}
+        envs = max(cells, key=lambda n: cells[n])
+        return f"{cells[envs] / 1e6:.2f} M/s ({envs} environments)"
+
+    parts = [f"{name[5:-3]} {us:.2f}" for name, us in one.items() if name.startswith("part ")]
+    environment = [f"{v / 1e3:.0f} k/s ({n})" for (w, n), v in at.items() if w == "environment"]
+    share, rate = one["learner_matmul_share"], one["matmul_gflops"]
+    rows = [
+        ["physics steps of 2 ms, chain engine", best("chain")],
+        ["C MuJoCo, `mujoco.batch`, all cores", best("c-batch")],
+        ["C MuJoCo, `mujoco.rollout`, all cores", best("c-rollout")],
+        ["MJX, its CPU flag set", best("mjx")],
+        ["chain over C, each at its best batch", f"{one['chain_over_c']:.0f} times"],
+        ["chain over MJX, 2048 environments", f"{one['chain_over_mjx']:.0f} times"],
+        ["gradient of ten steps over the steps", f"{one['gradient_over_forward']:.1f} times"],
+        ["environment, control steps of 20 ms", ", ".join(environment)],
+        ["its parts alone, us a control step", ", ".join(parts)],
+        ["rollout with the policy", f"{one['rollout_steps_per_s'] / 1e3:.0f} k control steps/s"],
+        ["PPO, learning included", f"{one['training_steps_per_s'] / 1e3:.1f} k control steps/s"],
+        ["learner, of the machine's matrix rate", f"{100 * share:.0f} % of {rate:.0f} GFlop/s"],
+        [
+            "`train` to its first metrics, cache empty / full",
+            f"{one['compile cold s']:.0f} s / {one['compile warm s']:.0f} s",
+        ],
+        ["peak memory, 16,384 environments, no learner", f"{one['peak_memory_gib']:.2f} GiB"],
+    ]
+    return markdown(["what", "here"], rows) + "\n\nSource: " + source(stored[0])
+
+
 def observation() -> str:
     """The observation's table, from the code."""
     from mcx_jax.envs.observe import OBS_TABLE
@@ -147,6 +185,7 @@ TABLES = {
     "headline": headline,
     "baseline": baseline,
     "controllers": controllers,
+    "speed": speed,
     "observation": observation,
     "presets": presets,
 }

@@ -241,7 +241,7 @@ class FirstOrderConfig:
     """Control steps that a gradient reaches through; the longest delay of the paper is two."""
     windows: int = 10
     """Windows of --horizon-steps, each with one gradient step, in one iteration."""
-    learning_rate: float = 5e-4
+    learning_rate: float = 1e-3
     """Adam step size, falling along half a cosine to 5 % (3e-3 diverges)."""
 
     def __post_init__(self) -> None:

@@ -27,7 +27,7 @@ class BenchConfig:
     """How fast everything is on this machine, rivals included, in one run. Let nothing else run."""
 
     quick: bool = False
-    """Fewer batch sizes and no cold start; under two minutes on two cores."""
+    """Fewer batch sizes, no gradient and no cold start: three minutes on two cores."""
     json: str = ""
     """Write the figures to this file; - or no value: to the terminal, and the report to stderr."""
     plot: str = ""
