@@ -6,11 +6,12 @@ from typing import Any
 from mcx_jax.errors import UserError
 
 STYLES = {
-    "chain": ("mcx_jax chain engine", "#0b6e4f", "o"),
-    "c-batch": ("C MuJoCo, mujoco.batch", "#c8553d", "s"),
-    "c-rollout": ("C MuJoCo, mujoco.rollout", "#e8a33d", "^"),
-    "mjx": ("MuJoCo MJX", "#4a6fa5", "D"),
+    "chain": ("mcx_jax chain engine", "#0b6e4f", "o", 0),
+    "c-batch": ("C MuJoCo, mujoco.batch", "#c8553d", "s", 4),
+    "c-rollout": ("C MuJoCo, mujoco.rollout", "#b9770e", "^", -6),
+    "mjx": ("MuJoCo MJX", "#4a6fa5", "D", 0),
 }
+"""Label, colour, marker, and how far up the label is moved (points; the C engines lie close)."""
 
 
 def draw(figures: dict[str, Any], path: Path) -> None:
@@ -25,14 +26,14 @@ def draw(figures: dict[str, Any], path: Path) -> None:
         raise UserError("--plot needs matplotlib: pip install 'mcx_jax[viz]'") from None
     figure = Figure(figsize=(8, 4.6), layout="constrained")
     axes = figure.subplots()
-    for engine, (label, colour, marker) in STYLES.items():
+    for engine, (label, colour, marker, lift) in STYLES.items():
         rows = [row for row in figures["physics"] if row["engine"] == engine]
         envs, speed = [r["envs"] for r in rows], [r["steps_per_s"] for r in rows]
         axes.loglog(envs, speed, color=colour, marker=marker, ms=5, lw=1.8)
         axes.annotate(
             label,
             (envs[-1], speed[-1]),
-            xytext=(8, 0),
+            xytext=(8, lift),
             textcoords="offset points",
             color=colour,
             va="center",
@@ -43,6 +44,8 @@ def draw(figures: dict[str, Any], path: Path) -> None:
     axes.set_title("UR10e physics: " + figures["device"], fontsize=10, loc="left")
     axes.grid(True, which="major", color="0.88")
     axes.spines[["top", "right"]].set_visible(False)
-    low, high = axes.get_xlim()
-    axes.set_xlim(low, high * 30)  # room for the labels
+    largest = max(row["envs"] for row in figures["physics"])
+    axes.set_xlim(0.7, 40 * largest)  # room for the labels
+    axes.set_xticks([10**k for k in range(6) if 10**k <= largest])
+    axes.minorticks_off()
     figure.savefig(path, dpi=150)
