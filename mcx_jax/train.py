@@ -259,7 +259,7 @@ def train(run: RunDir, make_env: Callable[..., Any]) -> "Policy":
     compiled = compile_iteration(config, env, state)
     print(
         f"set-up {short_time(ready - begun)}, compile {short_time(time.monotonic() - ready)}; "
-        f"{config.iterations} iterations of {config.num_envs} x {config.ppo.window_steps} steps",
+        f"{config.iterations} iterations of {config.num_envs} x {config.iteration_steps} steps",
         flush=True,
     )
     run.create()
