@@ -1,6 +1,6 @@
 """`python -m mcx_jax.bench`: every engine, the environment, the rollout, training, compile times.
 
-All in one run, rivals included; medians of five; compile times apart.
+All in one run, rivals included; medians of five (long calls under --quick: three); compile times apart.
 """
 
 import json
@@ -27,7 +27,7 @@ class BenchConfig:
     """How fast everything is on this machine, rivals included, in one run. Let nothing else run."""
 
     quick: bool = False
-    """Fewer batch sizes, no gradient and no cold start: three minutes on two cores."""
+    """Fewer batch sizes, no gradient, no cold start: two minutes on two cores once compiled."""
     json: str = ""
     """Write the figures to this file; - or no value: to the terminal, and the report to stderr."""
     plot: str = ""
@@ -49,6 +49,7 @@ def run(quick: bool, say) -> dict[str, Any]:
     import jax
 
     from mcx_jax.bench import physics, program, startup_time
+    from mcx_jax.bench.timing import REPEATS
     from mcx_jax.config import TrainConfig
     from mcx_jax.envs.v2v import make_env
     from mcx_jax.ppo import trainer
@@ -84,7 +85,7 @@ def run(quick: bool, say) -> dict[str, Any]:
     figures["peak_memory_gib"] = peak_memory_gib()
     say(f"peak memory so far, no learner: {figures['peak_memory_gib']:.2f} GiB")
 
-    speed = program.training_speed(config, env, state)
+    speed = program.training_speed(config, env, state, 3 if quick else REPEATS)
     figures.update(asdict(speed))
     figures["matmul_gflops"] = program.matmul_gflops()
     figures["learner_matmul_share"] = speed.learner_gflops / figures["matmul_gflops"]

@@ -90,7 +90,9 @@ class TrainingSpeed:
     """Useful floating-point operations of the learner's matrix products, 1e9/s."""
 
 
-def training_speed(config: TrainConfig, env: V2VEnv, state: trainer.TrainState) -> TrainingSpeed:
+def training_speed(
+    config: TrainConfig, env: V2VEnv, state: trainer.TrainState, repeats: int
+) -> TrainingSpeed:
     """Time the rollout, the learner and the whole iteration of PPO."""
     # The KL stop would skip policy steps: here every planned step is computed.
     config = replace(config, ppo=replace(config.ppo, target_kl=1e6))
@@ -114,11 +116,11 @@ def training_speed(config: TrainConfig, env: V2VEnv, state: trainer.TrainState) 
         return learn(ppo, nets, rates, learner, batch, key)
 
     steps = config.steps_per_iteration
-    rollout_s = median_s(lambda: jax.block_until_ready(collect(env, state.actors)))
+    rollout_s = median_s(lambda: jax.block_until_ready(collect(env, state.actors)), repeats)
     batch = prepare(collect(env, state.actors)[1])
-    learn_s = median_s(lambda: jax.block_until_ready(learn_once(state.learner, batch)))
+    learn_s = median_s(lambda: jax.block_until_ready(learn_once(state.learner, batch)), repeats)
     iterate = jax.jit(partial(trainer.train_iteration, config))
-    iteration_s = median_s(lambda: jax.block_until_ready(iterate(env, state)))
+    iteration_s = median_s(lambda: jax.block_until_ready(iterate(env, state)), repeats)
     flops = steps * ppo.epochs * learner_flops(env.obs_size, ppo.hidden, (env.action_size, 1))
     return TrainingSpeed(
         rollout_steps_per_s=steps / rollout_s,

@@ -20,7 +20,10 @@ def median_s(call: Callable[[], Any], repeats: int = REPEATS) -> float:
     call()
     once = _elapsed_s(call, 1)
     count = max(1, round(MIN_S / max(once, 1e-9)))
-    return statistics.median(_elapsed_s(call, count) / count for _ in range(repeats))
+    samples = [once] if count == 1 else []
+    while len(samples) < repeats:
+        samples.append(_elapsed_s(call, count) / count)
+    return statistics.median(samples)
 
 
 def _elapsed_s(call: Callable[[], Any], count: int) -> float:
