@@ -1,6 +1,7 @@
 """`python -m mcx_jax.bench`: every engine, the environment, the rollout, training, compile times.
 
-All in one run, rivals included; medians of five (long calls under --quick: three); compile times apart.
+All in one run, rivals included; medians of five (training under --quick: three); compile times
+apart.
 """
 
 import json
