@@ -8,8 +8,10 @@ import contextlib
 import dataclasses
 import io
 import json
+import os
 import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import tyro
@@ -114,6 +116,33 @@ def optional_value(argv: Sequence[str], flag: str, default: str) -> list[str]:
         if word == flag and bare:
             words[-1] = f"{flag}={default}"
     return words
+
+
+def check_output(flag: str, path: str) -> None:
+    """Refuse, before any work, a file that could not be written at its end.
+
+    Args:
+        path: as given with `flag`; "" (none) and "-" (standard output) are fine.
+    """
+    if path in ("", "-"):
+        return
+    target = Path(path)
+    if not target.parent.is_dir():
+        raise UserError(f"{flag} {path}: no such directory")
+    if target.is_dir():
+        raise UserError(f"{flag} {path}: is a directory; name a file")
+    if not os.access(target if target.exists() else target.parent, os.W_OK):
+        raise UserError(f"{flag} {path}: not writable; choose another file")
+
+
+def write_output(flag: str, path: str, text: str) -> None:
+    """Write a result to the file that was given with `flag`."""
+    try:
+        Path(path).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UserError(
+            f"{flag} {path}: cannot be written ({error.strerror}); choose a writable file"
+        ) from None
 
 
 def config_to_json(config: Any) -> str:

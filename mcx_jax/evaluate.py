@@ -271,8 +271,7 @@ def main(argv: list[str] | None = None) -> None:
     config = cli.parse(EvaluateConfig, cli.optional_value(argv, "--json", "-"), prog="evaluate")
     quiet = config.json == "-"
     report = sys.stderr if quiet else sys.stdout
-    if config.json not in ("", "-") and not Path(config.json).parent.is_dir():
-        raise UserError(f"--json {config.json}: no such directory")
+    cli.check_output("--json", config.json)
     for line in startup.configure(config.device):
         print(line, file=report)
     print(config.env.parsed_delay.describe(), file=report)
@@ -284,7 +283,7 @@ def main(argv: list[str] | None = None) -> None:
     if quiet:
         print(json.dumps(rows, indent=1))
     elif config.json:
-        Path(config.json).write_text(json.dumps(rows, indent=1) + "\n")
+        cli.write_output("--json", config.json, json.dumps(rows, indent=1) + "\n")
 
 
 if __name__ == "__main__":

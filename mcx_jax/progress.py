@@ -13,18 +13,6 @@ PLAIN_INTERVAL_S = 10.0
 REJECTED_WARNING = 0.5
 
 
-def describe_device() -> str:
-    """Device and versions in one line."""
-    from importlib.metadata import version
-
-    import jax
-
-    devices = jax.devices()
-    names = "jax", "jaxlib", "flax", "mujoco"
-    versions = ", ".join(f"{name} {version(name)}" for name in names)
-    return f"device: {len(devices)} x {devices[0].device_kind} ({devices[0].platform}); {versions}"
-
-
 def short_time(seconds: float) -> str:
     """12 s, 3 min 20 s or 1 h 05 min."""
     whole = round(seconds)

@@ -16,9 +16,9 @@ from pathlib import Path
 from types import FrameType, ModuleType
 from typing import TYPE_CHECKING, Any, Literal, Self
 
-from mcx_jax import checkpoint, cli
+from mcx_jax import checkpoint, cli, machine
 from mcx_jax.config import TrainConfig, preset_config
-from mcx_jax.progress import Progress, describe_device, short_time
+from mcx_jax.progress import Progress, short_time
 from mcx_jax.run_dir import POLICY, RunDir, default_path, open_existing, open_new, stored_config
 
 if TYPE_CHECKING:
@@ -313,7 +313,7 @@ def main(argv: list[str] | None = None) -> None:
         print(compile_quickly())
     for line in startup.configure(command.device):
         print(line)
-    print(describe_device())
+    print(machine.describe())
     print(run.config.env.parsed_delay.describe())
     print(f"run directory: {run.path}", flush=True)
     from mcx_jax.envs.v2v import make_env

@@ -109,6 +109,7 @@ class FakeState:
     "words, message",
     [
         (["--json", "nowhere/b.json"], "--json nowhere/b.json: no such directory"),
+        (["--json", "."], "--json .: is a directory; name a file"),
         (["--plot", "b.gif"], "--plot b.gif: the name must end in .png or .svg"),
     ],
 )

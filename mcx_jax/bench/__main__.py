@@ -4,14 +4,15 @@ All in one run, rivals included; medians of five (training under --quick: three)
 apart.
 """
 
+import importlib.util
 import json
-import os
 import resource
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from mcx_jax import machine
 from mcx_jax.errors import UserError
 
 ENVS = (1, 4, 16, 64, 256, 512, 1024, 2048, 4096, 8192, 16384)
@@ -55,7 +56,7 @@ def run(quick: bool, say) -> dict[str, Any]:
     from mcx_jax.envs.v2v import make_env
     from mcx_jax.ppo import trainer
 
-    figures: dict[str, Any] = {"device": device(), "versions": versions()}
+    figures: dict[str, Any] = {"device": machine.device(), "versions": machine.versions()}
     figures["physics"] = rows = []
     for engine, speed in physics.ENGINES.items():
         for envs in batch_sizes(engine, quick):
@@ -130,33 +131,6 @@ def ratios(rows: list[dict[str, Any]]) -> dict[str, float]:
     }
 
 
-def device() -> str:
-    """The machine in words."""
-    import jax
-
-    found = jax.devices()[0]
-    kind = cpu_name() if found.platform == "cpu" else found.device_kind
-    return f"{kind}, {os.cpu_count()} CPU cores"
-
-
-def cpu_name() -> str:
-    """The processor's name as Linux gives it, or `cpu`."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return "cpu"
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else "cpu"
-
-
-def versions() -> dict[str, str]:
-    """Of what the figures depend on."""
-    from importlib.metadata import version
-
-    packages = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")
-    return {"python": sys.version.split()[0], **{name: version(name) for name in packages}}
-
-
 def peak_memory_gib() -> float:
     """Peak resident memory of this process."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
@@ -168,11 +142,12 @@ def main(argv: list[str] | None = None) -> None:
 
     argv = list(sys.argv[1:] if argv is None else argv)
     config = cli.parse(BenchConfig, cli.optional_value(argv, "--json", "-"), prog="bench")
-    for flag, path in (("--json", config.json), ("--plot", config.plot)):
-        if path not in ("", "-") and not Path(path).parent.is_dir():
-            raise UserError(f"{flag} {path}: no such directory")
+    cli.check_output("--json", config.json)
+    cli.check_output("--plot", config.plot)
     if config.plot and Path(config.plot).suffix not in (".png", ".svg"):
         raise UserError(f"--plot {config.plot}: the name must end in .png or .svg")
+    if config.plot and importlib.util.find_spec("matplotlib") is None:
+        raise UserError("--plot needs matplotlib: install the 'viz' extra")
     report = sys.stderr if config.json == "-" else sys.stdout
 
     def say(line: str) -> None:
@@ -185,7 +160,7 @@ def main(argv: list[str] | None = None) -> None:
     if config.json == "-":
         print(text)
     elif config.json:
-        Path(config.json).write_text(text + "\n")
+        cli.write_output("--json", config.json, text + "\n")
     if config.plot:
         from mcx_jax.bench.plot import draw
 

@@ -3,8 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-from mcx_jax.errors import UserError
-
 STYLES = {
     "chain": ("mcx_jax chain engine", "#0b6e4f", "o", 0),
     "c-batch": ("C MuJoCo, mujoco.batch", "#c8553d", "s", 4),
@@ -15,15 +13,9 @@ STYLES = {
 
 
 def draw(figures: dict[str, Any], path: Path) -> None:
-    """Draw the physics rows of a bench result.
+    """Draw the physics rows of a bench result (matplotlib: extra `viz`)."""
+    from matplotlib.figure import Figure
 
-    Raises:
-        UserError: matplotlib is not installed.
-    """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise UserError("--plot needs matplotlib: pip install 'mcx_jax[viz]'") from None
     figure = Figure(figsize=(8, 4.6), layout="constrained")
     axes = figure.subplots()
     for engine, (label, colour, marker, lift) in STYLES.items():

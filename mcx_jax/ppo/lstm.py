@@ -4,8 +4,9 @@ whose leaves are zeros at the start of an episode): that is all that the network
 The LSTM is the textbook one (Hochreiter & Schmidhuber 1997, forget gate of Gers et al. 2000) with
 its four gates in one matrix, order input, forget, cell, output. A step is one product of [input,
 last output] with both matrices: hoisting the input's product out of the scan, as is usual, writes
-and reads back (T, B, 4H) numbers, 30 % slower on two CPU cores. The reverse mode is written out:
-one product a step, and one over all steps for the gradient of the matrices.
+and reads back (T, B, 4H) numbers (two CPU cores, 256 rows: the network's forward pass took 5.2
+instead of 3.8 us a step, its gradient 15.6 instead of 14.5). The reverse mode is written out: one
+product a step, and one over all steps for the gradient of the matrices.
 """
 
 import flax.linen as nn
@@ -100,7 +101,8 @@ def _activate(pre: jax.Array) -> jax.Array:
     """Activations of the four gates: pre (..., 4H) -> (..., 4H), the third block tanh.
 
     sigmoid(x) = 1/2 + tanh(x/2) / 2 makes all four one tanh between a scale and a shift, which is
-    one loop over (B, 4H): splitting, activating and joining the blocks took twice as long.
+    one loop over (B, 4H). Splitting, activating and joining the blocks made a sequence's forward
+    pass take twice as long.
     """
     is_cell = jnp.arange(4).repeat(pre.shape[-1] // 4) == 2
     scale = jnp.where(is_cell, 1.0, 0.5)

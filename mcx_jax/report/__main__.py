@@ -9,7 +9,7 @@ import os
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -35,8 +35,8 @@ class ReportConfig:
     """Seed of the episodes' windows and goals, as in evaluate."""
     show: int = 0
     """Which of the episodes (0, 1, ...) is drawn over time, in the last sea."""
-    device: str = "auto"
-    """auto, cpu or gpu."""
+    device: Literal["auto", "cpu", "gpu"] = "auto"
+    """Where to run; auto = GPU if JAX has one."""
     env: EnvConfig = field(default_factory=EnvConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
 

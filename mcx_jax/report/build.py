@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mcx_jax import machine
 from mcx_jax.config import CONTROL_DT_S
 from mcx_jax.evaluate import Errors, errors_beside_ik, evaluation_env, rows_beside_ik
 from mcx_jax.report import sections, style
@@ -144,16 +145,14 @@ def _learning_sections(config, entries: Sequence[Entry], rows: Rows, colours) ->
 def _facts(config, entries: Sequence[Entry], argv: Sequence[str]) -> dict[str, str]:
     from importlib.metadata import version
 
-    from mcx_jax.bench.__main__ import device, versions
-
-    packages = {**versions(), "matplotlib": version("matplotlib")}
+    packages = {**machine.versions(), "matplotlib": version("matplotlib")}
     metas = [(e, e.controller.policy.meta) for e in entries if e.learned]
     policies = [f"{e.label} = {e.who}, iteration {m.iteration}, seed {m.seed}" for e, m in metas]
     return {
         "command": f"python -m mcx_jax.report {shlex.join(argv)}",
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "versions": ", ".join(f"{name} {value}" for name, value in packages.items()),
-        "device": device(),
+        "device": machine.device(),
         "policies": "; ".join(policies) or "none",
         "task": json.dumps(asdict(config.env)),
         "motion": json.dumps(asdict(config.motion)),

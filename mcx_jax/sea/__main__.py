@@ -6,6 +6,7 @@ import math
 import pathlib
 import sys
 
+from mcx_jax import cli
 from mcx_jax.errors import UserError
 from mcx_jax.sea.spectrum import SEAS
 from mcx_jax.sea.statistics import (
@@ -57,20 +58,11 @@ def main() -> int:
         figures = report(goal_speed(build_tables(list(SEAS.values()), "train")))
         print("\n".join(lines(figures)))
         if args.json:
-            _write(args.json, figures)
+            cli.write_output("--json", str(args.json), json.dumps(figures, indent=1) + "\n")
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     return 0
-
-
-def _write(path: pathlib.Path, figures: dict) -> None:
-    try:
-        path.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise UserError(
-            f"--json {path}: cannot be written ({error.strerror}); choose a writable file"
-        ) from None
 
 
 if __name__ == "__main__":
