@@ -19,6 +19,7 @@ CONTROL_DT_S = PHYSICS_DT_S * SUBSTEPS
 """Control step: 50 Hz (paper; authors' code)."""
 NYQUIST_HZ = 0.5 / CONTROL_DT_S
 
+MAX_SHARDS = 64
 MAX_DELAY_S = 1.0
 """Longest delay accepted: evaluation looks that far ahead, and slower filters drift in float32."""
 
@@ -338,6 +339,22 @@ class TrainConfig:
     def reset_groups(self) -> int:
         """Environments are reset in this many groups, one an iteration (see ppo.rollout)."""
         return self.env.episode_steps // self.iteration_steps
+
+    @property
+    def shards(self) -> int:
+        """S, the number of equal groups of environments that resets and minibatches treat alike
+        (see sharding). As many as possible, up to 64: more devices than that are not used."""
+        ppo = self.ppo
+        sequences = ppo.window_steps // ppo.sequence_steps if self.algo == "ppo" else 1
+        minibatches = ppo.minibatches if self.algo == "ppo" else 1
+
+        def fits(shards: int) -> bool:
+            envs, rest = divmod(self.num_envs, shards)
+            return (
+                not rest and envs >= self.reset_groups and envs * sequences % minibatches == 0
+            )
+
+        return max([s for s in range(1, MAX_SHARDS + 1) if fits(s)], default=1)
 
     @property
     def steps_per_iteration(self) -> int:

@@ -95,11 +95,17 @@ def episode_errors(env, controller, gains: tuple[float, ...], episodes: int, see
     import jax
     import jax.numpy as jnp
 
+    from mcx_jax.sharding import env_mesh, put
+
     shape = (len(gains), len(env.motion.seas), episodes)
     keys = jnp.tile(jax.random.split(jax.random.key(seed), episodes), shape[0] * shape[1])
     seas = jnp.broadcast_to(jnp.arange(shape[1], dtype=jnp.int32)[:, None], shape).ravel()
     gain = jnp.broadcast_to(jnp.asarray(gains)[:, None, None], shape).ravel()
-    dp, da, valid = jax.device_get(_compiled()(env, controller, keys, seas, gain))
+    mesh = env_mesh(keys.size)
+    env, controller = put(mesh, (env, controller))
+    keys, seas, gain = put(mesh, (keys, seas, gain), 0)
+    with jax.set_mesh(mesh):
+        dp, da, valid = jax.device_get(_compiled()(env, controller, keys, seas, gain))
     return dp.reshape(-1, *shape), da.reshape(-1, *shape), valid.reshape(shape)
 
 
@@ -272,7 +278,7 @@ def main(argv: list[str] | None = None) -> None:
     quiet = config.json == "-"
     report = sys.stderr if quiet else sys.stdout
     cli.check_output("--json", config.json)
-    for line in startup.configure(config.device):
+    for line in startup.configure(config.device, mjx=config.env.physics == "mjx"):
         print(line, file=report)
     print(config.env.parsed_delay.describe(), file=report)
     who, controller = load_controller(config.who)

@@ -164,7 +164,12 @@ def _sincos_jvp(primals, tangents):
 
 def rotation_rpy(roll: Scalar, pitch: Scalar, yaw: Scalar) -> Mat:
     """Rz(yaw) Ry(pitch) Rx(roll), angles in radians (aerospace order, extrinsic xyz)."""
-    (sr, cr), (sp, cp), (sy, cy) = sincos(roll), sincos(pitch), sincos(yaw)
+    return rotation_of_turns([sincos(roll), sincos(pitch), sincos(yaw)])
+
+
+def rotation_of_turns(turns: Sequence[tuple[Scalar, Scalar]]) -> Mat:
+    """`rotation_rpy` from (sin, cos) of roll, pitch and yaw."""
+    (sr, cr), (sp, cp), (sy, cy) = turns
     return (
         (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
         (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
@@ -181,8 +186,9 @@ def exp_rotation(v: Vec) -> Mat:
     t2 = dot(v, v)
     small = t2 < 1e-4
     t = jnp.sqrt(jnp.where(small, 1.0, t2))
-    a = jnp.where(small, 1.0 - t2 / 6.0, jnp.sin(t) / t)
-    b = jnp.where(small, 0.5 - t2 / 24.0, (1.0 - jnp.cos(t)) / (t * t))
+    sin, cos = sincos(t)
+    a = jnp.where(small, 1.0 - t2 / 6.0, sin / t)
+    b = jnp.where(small, 0.5 - t2 / 24.0, (1.0 - cos) / (t * t))
     x, y, z = v
     return (
         (1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y),

@@ -22,6 +22,8 @@ from mcx_jax.progress import Progress, short_time
 from mcx_jax.run_dir import POLICY, RunDir, default_path, open_existing, open_new, stored_config
 
 if TYPE_CHECKING:
+    from jax.sharding import Mesh
+
     from mcx_jax.policy import Policy
     from mcx_jax.ppo.trainer import IterationMetrics, TrainState
 
@@ -125,19 +127,25 @@ def algorithm(config: TrainConfig) -> ModuleType:
     return {"ppo": ppo, "first-order": first_order}[config.algo]
 
 
-def start(run: RunDir, env: Any) -> "TrainState":
+def start(run: RunDir, env: Any, mesh: "Mesh") -> "TrainState":
     """The state to begin with: new, or the last checkpoint's. A seed axis if --seeds > 1."""
     import jax
+
+    from mcx_jax.ppo.rollout import layout
+    from mcx_jax.sharding import put
 
     config, algo = run.config, algorithm(run.config)
     if config.seeds > 1:
         keys = jax.vmap(jax.random.key)(jax.numpy.arange(config.seed, config.seed + config.seeds))
-        first = jax.jit(algo.init_seeds, static_argnums=0)
+        init = functools.partial(algo.init_seeds, config)
     else:
-        keys, first = jax.random.key(config.seed), jax.jit(algo.init, static_argnums=0)
+        keys, init = jax.random.key(config.seed), functools.partial(algo.init, config)
+    keys = put(mesh, keys)
+    like = jax.eval_shape(init, env, keys)
+    placed = layout(mesh, like)
     if run.start_iteration:
-        return checkpoint.restore_latest(run.path, jax.eval_shape(first, config, env, keys))
-    return jax.block_until_ready(first(config, env, keys))
+        return jax.device_put(checkpoint.restore_latest(run.path, like), placed)
+    return jax.block_until_ready(jax.jit(init, out_shardings=placed)(env, keys))
 
 
 def compile_iteration(config: TrainConfig, env: Any, state: "TrainState") -> Callable[..., Any]:
@@ -146,7 +154,8 @@ def compile_iteration(config: TrainConfig, env: Any, state: "TrainState") -> Cal
 
     algo = algorithm(config)
     iteration = algo.train_iteration_seeds if config.seeds > 1 else algo.train_iteration
-    jitted = jax.jit(iteration, static_argnums=0, donate_argnums=2)
+    placed = jax.tree.map(lambda x: x.sharding, state)
+    jitted = jax.jit(iteration, static_argnums=0, donate_argnums=2, out_shardings=(placed, None))
     return jitted.lower(config, env, state).compile()
 
 
@@ -176,7 +185,7 @@ def policies_of(config: TrainConfig, state: "TrainState") -> "list[Policy]":
 
     from mcx_jax.policy import Policy, PolicyMeta
 
-    arrays = (state.learner.policy.params, state.obs_stats, state.iteration)
+    arrays = jax.device_get((state.learner.policy.params, state.obs_stats, state.iteration))
     if config.seeds == 1:
         arrays = jax.tree.map(lambda x: x[None], arrays)
     actions = arrays[0]["params"]["raw_sigma"].shape[-1]
@@ -251,12 +260,18 @@ def train(run: RunDir, make_env: Callable[..., Any]) -> "Policy":
         UserError: the arm, the motion or the checkpoint cannot be used.
         SystemExit: stopped by a signal, after saving.
     """
+    import jax
+
+    from mcx_jax.sharding import env_mesh, put
+
     config = run.config
     begun = time.monotonic()
-    env = make_env(config.env, config.motion, split="train")
-    state = start(run, env)
-    ready = time.monotonic()
-    compiled = compile_iteration(config, env, state)
+    mesh = env_mesh(config.shards)
+    env = put(mesh, make_env(config.env, config.motion, split="train"))
+    with jax.set_mesh(mesh):
+        state = start(run, env, mesh)
+        ready = time.monotonic()
+        compiled = compile_iteration(config, env, state)
     print(
         f"set-up {short_time(ready - begun)}, compile {short_time(time.monotonic() - ready)}; "
         f"{config.iterations} iterations of {config.num_envs} x {config.iteration_steps} steps",
@@ -311,7 +326,7 @@ def main(argv: list[str] | None = None) -> None:
     command, run = read_command(list(sys.argv[1:] if argv is None else argv))
     if command.smoke:
         print(compile_quickly())
-    for line in startup.configure(command.device):
+    for line in startup.configure(command.device, mjx=run.config.env.physics == "mjx"):
         print(line)
     print(machine.describe())
     print(run.config.env.parsed_delay.describe())

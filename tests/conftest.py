@@ -22,7 +22,8 @@ try:
 except ImportError as error:  # a broken start-up module must fail its own tests, not all of them
     START_UP = [f"mcx_jax.startup is missing: {error}"]
 else:
-    START_UP = configure()
+    # One device, as a library user has it; tests of several start processes of their own.
+    START_UP = configure(mjx=True, cores=1)
 
 CHEAP = (
     "test_assets",

@@ -7,7 +7,14 @@ import sys
 import pytest
 
 from mcx_jax.errors import UserError
-from mcx_jax.startup import FUSION_FLAG, run_command, xla_flags_for
+from mcx_jax.startup import (
+    DEVICES_FLAG,
+    FUSION_FLAG,
+    PASSES_FLAG,
+    SPLIT_PASS,
+    run_command,
+    xla_flags_for,
+)
 
 
 @pytest.mark.parametrize(
@@ -23,7 +30,17 @@ from mcx_jax.startup import FUSION_FLAG, run_command, xla_flags_for
     ],
 )
 def test_the_fusion_flag_goes_by_version(version, current, want):
-    assert xla_flags_for(version, current) == want
+    assert xla_flags_for(version, current, mjx=True) == want
+    assert xla_flags_for(version, current) == current
+
+
+def test_a_device_per_core_unless_the_user_has_set_it():
+    want = f"{DEVICES_FLAG}=4 {PASSES_FLAG}={SPLIT_PASS}"
+    assert xla_flags_for("0.10.2", "", cores=4) == want
+    assert xla_flags_for("0.10.2", "--xla_a=1", cores=4) == f"--xla_a=1 {want}"
+    for users in (f"{DEVICES_FLAG}=8", f"{PASSES_FLAG}=some-pass"):
+        assert xla_flags_for("0.10.2", users, cores=4) == users
+    assert xla_flags_for("0.10.2", "", cores=1) == ""
 
 
 def test_a_users_mistake_is_one_line_and_code_2(capsys):

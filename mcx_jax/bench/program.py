@@ -113,7 +113,7 @@ def training_speed(
     @jax.jit
     def learn_once(learner, batch):
         rates = jnp.float32(ppo.policy_lr), jnp.float32(ppo.value_lr)
-        return learn(ppo, nets, rates, learner, batch, key)
+        return learn(ppo, nets, rates, learner, batch, key, config.shards)
 
     steps = config.steps_per_iteration
     rollout_s = median_s(lambda: jax.block_until_ready(collect(env, state.actors)), repeats)

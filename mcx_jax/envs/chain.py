@@ -173,8 +173,8 @@ def substeps(
     commands = [ctrl[i] for i in range(len(model.actuators))]
 
     def body(i, state):
-        base = stage(wall, base_at, i)
         angles, rates = state
+        base = base_at(i)
         angles, rates = substep(model, integrator, angles, rates, commands, base, wall)
         return tuple(angles), tuple(rates)
 

@@ -100,15 +100,28 @@ def _newton(
     angles = stage(wall, partial(dynamics.joint_sincos, model), frozen)
     r, p, axes, anchors = stage(wall, partial(_kinematics, model), angles)
     e = stage(wall, _pose_error, (r, p), target)
-    error = norm(e[:3]) + norm(e[3:])
-    columns = [(*cross(z, vsub(p, o)), *z) for z, o in zip(axes, anchors, strict=True)]
-    damping = jnp.where(error > REGULARISATION_ABOVE, REGULARISATION, 0.0)
-    gram = stage(wall, _normal_matrix, columns, lax.stop_gradient(damping))
+    error = stage(wall, _error_norm, e)
+    columns = stage(wall, _jacobian, p, axes, anchors)
+    gram = stage(wall, _normal_matrix, columns, lax.stop_gradient(error))
     step = _least_squares(wall, columns, gram, e)
-    length = norm(step)
-    shrink = jnp.where(length > MAX_STEP_RAD, MAX_STEP_RAD / jnp.maximum(length, 1e-9), 1.0)
+    shrink = stage(wall, _shrink, step)
     moved = tuple(x + shrink * dx for x, dx in zip(frozen, step, strict=True))
     return _within_limits(model, moved), error
+
+
+def _error_norm(e: Sequence[Scalar]) -> Scalar:
+    return norm(e[:3]) + norm(e[3:])
+
+
+def _jacobian(tool: Vec, axes: list[Vec], anchors: list[Vec]) -> list[tuple]:
+    """Columns of the tool's Jacobian in B: what a unit joint rate moves (m) and turns (rad)."""
+    return [(*cross(z, vsub(tool, o)), *z) for z, o in zip(axes, anchors, strict=True)]
+
+
+def _shrink(step: Sequence[Scalar]) -> Scalar:
+    """Factor that keeps a step within MAX_STEP_RAD."""
+    length = norm(step)
+    return jnp.where(length > MAX_STEP_RAD, MAX_STEP_RAD / jnp.maximum(length, 1e-9), 1.0)
 
 
 def _pose_error(tool: tuple[Mat, Vec], target: tuple[Mat, Vec]) -> tuple[Scalar, ...]:
@@ -117,8 +130,10 @@ def _pose_error(tool: tuple[Mat, Vec], target: tuple[Mat, Vec]) -> tuple[Scalar,
     return (*vsub(target[1], tool[1]), *turn)
 
 
-def _normal_matrix(columns: list[tuple], damping: Scalar) -> list[list[Scalar]]:
-    """Lower triangle of J J^T + damping 1, for J given by its columns (one 6-vector a joint)."""
+def _normal_matrix(columns: list[tuple], error: Scalar) -> list[list[Scalar]]:
+    """Lower triangle of J J^T, for J given by its columns (one 6-vector a joint), damped where the
+    error norm is large."""
+    damping = jnp.where(error > REGULARISATION_ABOVE, REGULARISATION, 0.0)
     gram = [
         [total([mul(col[i], col[j]) for col in columns]) for j in range(i + 1)] for i in range(6)
     ]
@@ -133,7 +148,11 @@ def _least_squares(wall, columns: list[tuple], gram, e: tuple) -> list[Scalar]:
     """J^T (J J^T + damping 1)^-1 e."""
     factors = stage(wall, dynamics.factor, gram)
     multipliers = stage(wall, dynamics.solve, factors, list(e))
-    return [dot(col, multipliers) for col in columns]  # type: ignore[arg-type]
+
+    def combine(columns, multipliers):
+        return [dot(col, multipliers) for col in columns]
+
+    return stage(wall, combine, columns, multipliers)
 
 
 def _within_limits(model: ChainModel, q: tuple) -> tuple:

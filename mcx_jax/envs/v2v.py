@@ -187,8 +187,8 @@ class V2VEnv:
         """Motion of both vessels during the control step that begins at `step` (20 ms units)."""
         now = step * SUBSTEPS
         return (
-            vessels.segment(self.motion.knots_a, track.table, track.start_a + now),
-            vessels.segment(self.motion.knots_b, track.table, track.start_b + now),
+            vessels.segment(self.motion.knots_a, track.table, track.start_a + now, self.wall),
+            vessels.segment(self.motion.knots_b, track.table, track.start_b + now, self.wall),
         )
 
     def _simulate(
@@ -197,9 +197,11 @@ class V2VEnv:
         """The engine behind one function: physics steps of 2 ms with the references held."""
         ctrl = command(self.model, reference, rate)
         # The engines advance a base at physics step i by the deck's motion at that instant.
-        base_at = lambda i: vessels.base_state(seg_a, i)  # noqa: E731
+        base_at = lambda i: vessels.base_state(seg_a, i, self.wall)  # noqa: E731
         if self.mjx_model is None:
-            q, qd = chain.substeps(self.model, self.integrator, arm.q, arm.qd, ctrl, base_at, count)
+            q, qd = chain.substeps(
+                self.model, self.integrator, arm.q, arm.qd, ctrl, base_at, count, self.wall
+            )
         else:
             from mcx_jax.envs import mjx_engine
 

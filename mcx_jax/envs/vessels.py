@@ -16,16 +16,20 @@ from mcx_jax.envs.motion import Motion, Track
 from mcx_jax.sea.sampler import KNOT_STEPS, body_rates, hermite, segment_rows
 from mcx_jax.spatial import (
     Mat,
+    Scalar,
     Vec,
     matmul,
     matvec,
+    rotation_of_turns,
     rotation_rpy,
+    sincos,
     tmatvec,
     transpose,
     unpack,
     vadd,
     vsub,
 )
+from mcx_jax.stage import stage
 
 GRAVITY_M_S2 = 9.81
 REST_B_M: Vec = (0.65, 0.0, 0.0)
@@ -51,30 +55,42 @@ class Segment:
     first: jax.Array
     """() int32: physics steps from row0 to the beginning of the control step."""
 
-    def at(self, i: jax.Array | int) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def at(self, i: jax.Array | int) -> tuple[tuple[Scalar, ...], ...]:
         """Position (x y z m, roll pitch yaw rad), rate and acceleration at physics step i."""
         return hermite(self.row0, self.row1, self.first + i)
 
 
-def segment(knots: jax.Array, table: jax.Array, step: jax.Array) -> Segment:
+def segment(
+    knots: jax.Array, table: jax.Array, step: jax.Array, wall: jax.Array | None = None
+) -> Segment:
     """The segment that holds a physics step (int32, never float seconds) of a table."""
-    row0, row1 = segment_rows(knots, table, step)
+    row0, row1 = segment_rows(knots, table, step, wall)
     return Segment(row0=row0, row1=row1, first=step % KNOT_STEPS)
 
 
 def still(seg: Segment) -> Segment:
     """A vessel held at the segment's first pose."""
     x, _, _ = seg.at(0)
-    row = jnp.concatenate([x, jnp.zeros_like(x)])
+    row = jnp.stack([*x, *[jnp.zeros_like(x[0])] * 6])
     return Segment(row0=row, row1=row, first=seg.first)
 
 
-def base_state(seg: Segment, i: jax.Array | int) -> tuple[Vec, Vec, Vec]:
-    """Vessel A's (w, al, a) in its own axes at physics step i, as `chain.BaseState`."""
-    x, xd, xdd = seg.at(i)
-    rotation = rotation_rpy(x[3], x[4], x[5])
-    w, al = body_rates(x[3:], xd[3:], xdd[3:])
-    return unpack(w, 3), unpack(al, 3), tmatvec(rotation, (xdd[0], xdd[1], xdd[2] + GRAVITY_M_S2))
+def base_state(
+    seg: Segment, i: jax.Array | int, wall: jax.Array | None = None
+) -> tuple[Vec, Vec, Vec]:
+    """Vessel A's (w, al, a) in its own axes at physics step i, as `chain.BaseState`.
+
+    Three stages: as one, it took as long as the arm's physics.
+    """
+    x, xd, xdd = stage(wall, seg.at, i)
+    turns = stage(wall, lambda rpy: [sincos(angle) for angle in rpy], x[3:])
+
+    def seen_from_deck(turns, rate, accel):
+        w, al = body_rates(turns, rate, accel[3:])
+        upward = accel[2] + GRAVITY_M_S2
+        return w, al, tmatvec(rotation_of_turns(turns), (accel[0], accel[1], upward))
+
+    return stage(wall, seen_from_deck, turns, xd[3:], xdd)
 
 
 def goal_in_base(

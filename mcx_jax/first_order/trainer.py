@@ -21,6 +21,7 @@ from mcx_jax.ppo.networks import init_carry, init_params, step, unroll
 from mcx_jax.ppo.normalise import RunningStats, init_stats, merge, normalise_obs
 from mcx_jax.ppo.rollout import Actors, reset_all, reset_block, step_all
 from mcx_jax.ppo.trainer import learning_rate, networks_of
+from mcx_jax.sharding import over_envs
 from mcx_jax.ppo.update import Fitted, gradient_step, init_fitted
 
 
@@ -78,7 +79,7 @@ def init(config: TrainConfig, env: Any, key: jax.Array) -> TrainState:
     nets = networks_of(config.ppo, env.action_size)
     key, policy_key, env_key = jax.random.split(key, 3)
     params = init_params(nets.policy, policy_key, env.obs_size)
-    memory = init_carry(nets.policy, (config.num_envs,))
+    memory = over_envs(init_carry(nets.policy, (config.num_envs,)), 0)
     env_state = reset_all(env, env_key, config.num_envs)
     actors = Actors(env_state=env_state, policy_carry=memory, value_carry=())
     finite = jnp.all(jnp.isfinite(env_state.obs), axis=0).astype(jnp.float32)
@@ -142,7 +143,9 @@ def train_iteration(
     settings = config.first_order
     env = training_env(env)
     key, reset_key = jax.random.split(state.key)
-    actors = reset_block(env, state.actors, reset_key, state.iteration, config.reset_groups)
+    actors = reset_block(
+        env, state.actors, reset_key, state.iteration, config.reset_groups, config.shards
+    )
     lr = learning_rate(config, settings.learning_rate, state.iteration)
 
     def one_window(carry, _):

@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import flax.linen as nn
 import jax
+import jax.numpy as jnp
 
 
 @jax.custom_vjp
@@ -23,15 +24,19 @@ def _affine_forward(x: jax.Array, kernel: jax.Array, bias: jax.Array):
 
 def _affine_backward(saved: tuple[jax.Array, jax.Array], dy: jax.Array):
     x, kernel = saved
-    return dy @ kernel.T, kernel_gradient(x, dy), dy.reshape(-1, dy.shape[-1]).sum(axis=0)
+    return dy @ kernel.T, kernel_gradient(x, dy), dy.sum(axis=tuple(range(dy.ndim - 1)))
 
 
 affine.defvjp(_affine_forward, _affine_backward)
 
 
 def kernel_gradient(x: jax.Array, dy: jax.Array) -> jax.Array:
-    """Sum over all leading axes of x (..., F) times dy (..., O) -> (F, O)."""
-    return x.reshape(-1, x.shape[-1]).T @ dy.reshape(-1, dy.shape[-1])
+    """Sum over all leading axes of x (..., F) times dy (..., O) -> (F, O).
+
+    Not by merging the axes: one of them may lie over several devices.
+    """
+    leading = tuple(range(x.ndim - 1))
+    return jnp.tensordot(x, dy, (leading, leading))
 
 
 class Dense(nn.Module):

@@ -9,7 +9,8 @@ the environments form G blocks. At the START of window i the block i mod G is re
 reset inside a window: no step pays for a reset, no `cond` runs two branches under `vmap`, and all
 phases of an episode are in every window. A window's end is a truncation, not an end: the value of
 the last observation follows. Where G does not divide N, or N < G, neighbouring blocks share an
-environment, which is then reset earlier than need be: a shorter episode, otherwise harmless.
+environment, which is then reset earlier than need be: a shorter episode, otherwise harmless. Each of S shards (`sharding`) has
+its own G blocks, so that resetting moves nothing between devices.
 """
 
 from dataclasses import replace
@@ -18,10 +19,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jax.sharding import Mesh
 
 from mcx_jax.ppo.gaussian import action_distribution
 from mcx_jax.ppo.networks import Carry, Networks, Params, init_carry, step
 from mcx_jax.ppo.normalise import RunningStats, normalise_obs
+from mcx_jax.sharding import over_envs, shardings
 
 
 @struct.dataclass
@@ -74,9 +77,22 @@ class Window:
     last_obs: jax.Array
 
 
+def layout(mesh: Mesh, state: Any) -> Any:
+    """Shardings of a trainer's state (a seed axis in front or not): environments and memories over
+    the devices, everything else on each."""
+    actors = state.actors
+    placed = Actors(
+        env_state=shardings(mesh, actors.env_state, -1),
+        policy_carry=shardings(mesh, actors.policy_carry, -2),
+        value_carry=shardings(mesh, actors.value_carry, -2),
+    )
+    return replace(shardings(mesh, state), actors=placed)
+
+
 def reset_all(env: Any, key: jax.Array, num_envs: int) -> Any:
     """States of `num_envs` environments at the start of an episode, leaves (..., N)."""
-    return jax.vmap(env.reset, out_axes=-1)(jax.random.split(key, num_envs))
+    keys = over_envs(jax.random.split(key, num_envs), 0)
+    return over_envs(jax.vmap(env.reset, out_axes=-1)(keys), -1)
 
 
 def step_all(env: Any, env_state: Any, action: jax.Array) -> Any:
@@ -88,32 +104,38 @@ def init_actors(env: Any, nets: Networks, key: jax.Array, num_envs: int) -> Acto
     """All environments reset, all memories empty."""
     return Actors(
         env_state=reset_all(env, key, num_envs),
-        policy_carry=init_carry(nets.policy, (num_envs,)),
-        value_carry=init_carry(nets.value, (num_envs,)),
+        policy_carry=over_envs(init_carry(nets.policy, (num_envs,)), 0),
+        value_carry=over_envs(init_carry(nets.value, (num_envs,)), 0),
     )
 
 
 def reset_block(
-    env: Any, actors: Actors, key: jax.Array, iteration: jax.Array, groups: int
+    env: Any, actors: Actors, key: jax.Array, iteration: jax.Array, groups: int, shards: int
 ) -> Actors:
-    """Reset one of `groups` blocks of environments and empty its memories.
+    """Reset one of `groups` blocks of environments, in each shard, and empty its memories.
 
     Args:
         actors: of N environments.
         iteration: number of the window, (); block iteration mod groups is reset.
         groups: G, windows in an episode.
+        shards: S, divides N.
     """
-    num_envs = actors.env_state.obs.shape[-1]
-    size = -(-num_envs // groups)
-    start = (iteration % groups) * num_envs // groups
-    fresh = reset_all(env, key, size)
+    envs = actors.env_state.obs.shape[-1] // shards
+    size = -(-envs // groups)
+    start = (iteration % groups) * envs // groups
+    fresh = reset_all(env, key, shards * size)
 
     def last(old: jax.Array, new: jax.Array) -> jax.Array:
-        return jax.lax.dynamic_update_slice_in_dim(old, new, start, axis=old.ndim - 1)
+        parts = over_envs(old.reshape(*old.shape[:-1], shards, envs), -2)
+        new = over_envs(new.reshape(*new.shape[:-1], shards, size), -2)
+        parts = jax.lax.dynamic_update_slice_in_dim(parts, new, start, axis=parts.ndim - 1)
+        return over_envs(parts.reshape(old.shape), -1)
 
     def empty(old: jax.Array) -> jax.Array:
-        zeros = jnp.zeros((size, *old.shape[1:]), old.dtype)
-        return jax.lax.dynamic_update_slice_in_dim(old, zeros, start, axis=0)
+        parts = over_envs(old.reshape(shards, envs, *old.shape[1:]), 0)
+        zeros = jnp.zeros((shards, size, *old.shape[1:]), old.dtype)
+        parts = jax.lax.dynamic_update_slice_in_dim(parts, zeros, start, axis=1)
+        return over_envs(parts.reshape(old.shape), 0)
 
     return Actors(
         env_state=jax.tree.map(last, actors.env_state, fresh),

@@ -139,7 +139,9 @@ def train_iteration(
     ppo, nets = config.ppo, networks_of(config.ppo, env.action_size)
     key, reset_key, act_key, order_key = jax.random.split(state.key, 4)
     with jax.named_scope("rollout"):
-        actors = reset_block(env, state.actors, reset_key, state.iteration, config.reset_groups)
+        actors = reset_block(
+            env, state.actors, reset_key, state.iteration, config.reset_groups, config.shards
+        )
         act_keys = _step_keys(ppo, act_key)
         params = state.learner.policy.params
         after, window = collect(env, nets, params, state.obs_stats, actors, act_keys)
@@ -158,7 +160,9 @@ def train_iteration(
             learning_rate(config, ppo.policy_lr, state.iteration),
             learning_rate(config, ppo.value_lr, state.iteration),
         )
-        learner, stats = learn(ppo, nets, rates, state.learner, judged.batch, order_key)
+        learner, stats = learn(
+            ppo, nets, rates, state.learner, judged.batch, order_key, config.shards
+        )
     every_step = jnp.broadcast_to(judged.mask, judged.targets.shape)
     value_stats = merge(state.value_stats, judged.targets, every_step, VALUE_KEEP)
     learner = rescale_value(learner, state.value_stats, value_stats)

@@ -18,7 +18,7 @@ from mcx_jax.ppo.experience import Batch
 from mcx_jax.ppo.gaussian import action_distribution
 from mcx_jax.ppo.loss import SurrogateStats, clipped_surrogate, value_loss
 from mcx_jax.ppo.networks import Networks, Params, unroll
-from mcx_jax.ppo.sequences import minibatch_order
+from mcx_jax.ppo.sequences import minibatch_order, take
 
 KL_STOP_FACTOR = 1.5
 
@@ -186,25 +186,23 @@ def learn(
     learner: Learner,
     batch: Batch,
     key: jax.Array,
+    shards: int,
 ) -> tuple[Learner, UpdateStats]:
     """All updates of an iteration; the statistics are stacked, (epochs * minibatches,)."""
     sequences = batch.mask.shape[1]
-    order = minibatch_order(key, sequences, config.epochs, config.minibatches)
+    order = minibatch_order(key, sequences, config.epochs, config.minibatches, shards)
 
     def body(carry: tuple[Learner, jax.Array], chosen: jax.Array):
         learner, stopped = carry
-        learner, stats = update(config, nets, rates, learner, stopped, take(batch, chosen))
+        learner, stats = update(config, nets, rates, learner, stopped, _minibatch(batch, chosen))
         return (learner, stats.stepped == 0), stats
 
     (learner, _), stats = jax.lax.scan(body, (learner, jnp.zeros((), bool)), order)
     return learner, stats
 
 
-def take(batch: Batch, chosen: jax.Array) -> Batch:
-    """The sequences `chosen` (M,) of a batch."""
+def _minibatch(batch: Batch, chosen: jax.Array) -> Batch:
+    """The sequences `chosen` of a batch, see `sequences.take`."""
     per_step = replace(batch, policy_carry=None, value_carry=None)
-    steps = jax.tree.map(lambda x: jnp.take(x, chosen, axis=1), per_step)
-    carries = jax.tree.map(
-        lambda x: jnp.take(x, chosen, axis=0), (batch.policy_carry, batch.value_carry)
-    )
-    return replace(steps, policy_carry=carries[0], value_carry=carries[1])
+    policy_carry, value_carry = take((batch.policy_carry, batch.value_carry), chosen, 0)
+    return replace(take(per_step, chosen, 1), policy_carry=policy_carry, value_carry=value_carry)
