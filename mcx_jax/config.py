@@ -350,11 +350,14 @@ class TrainConfig:
 
         def fits(shards: int) -> bool:
             envs, rest = divmod(self.num_envs, shards)
-            return (
-                not rest and envs >= self.reset_groups and envs * sequences % minibatches == 0
-            )
+            return not rest and envs >= self.reset_groups and envs * sequences % minibatches == 0
 
         return max([s for s in range(1, MAX_SHARDS + 1) if fits(s)], default=1)
+
+    @property
+    def block_envs(self) -> int:
+        """Environments that are reset before an iteration: in every shard its share, rounded up."""
+        return self.shards * -(-self.num_envs // self.shards // self.reset_groups)
 
     @property
     def steps_per_iteration(self) -> int:

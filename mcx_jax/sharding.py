@@ -42,7 +42,8 @@ def over_envs(tree: Tree, axis: int) -> Tree:
 
 def _spec(x: jax.Array, axis: int) -> PartitionSpec:
     names: list[str | None] = [None] * x.ndim
-    names[axis] = ENV_AXIS
+    if x.size:  # JAX gives an array without elements to every device
+        names[axis] = ENV_AXIS
     return PartitionSpec(*names)
 
 

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import FrameType, ModuleType
+from types import FrameType
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from mcx_jax import checkpoint, cli, machine
@@ -22,10 +22,9 @@ from mcx_jax.progress import Progress, short_time
 from mcx_jax.run_dir import POLICY, RunDir, default_path, open_existing, open_new, stored_config
 
 if TYPE_CHECKING:
-    from jax.sharding import Mesh
-
     from mcx_jax.policy import Policy
     from mcx_jax.ppo.trainer import IterationMetrics, TrainState
+    from mcx_jax.programs import Training
 
 CHECKPOINT_INTERVAL_S = 60.0
 FINAL_EPISODES, FINAL_STEPS = 50, 1000
@@ -119,46 +118,6 @@ class StopRequest:
         print("\nstopping at the end of this iteration (again: at once)", flush=True)
 
 
-def algorithm(config: TrainConfig) -> ModuleType:
-    """The trainer module of the configuration's algorithm; both have the same functions."""
-    from mcx_jax.first_order import trainer as first_order
-    from mcx_jax.ppo import trainer as ppo
-
-    return {"ppo": ppo, "first-order": first_order}[config.algo]
-
-
-def start(run: RunDir, env: Any, mesh: "Mesh") -> "TrainState":
-    """The state to begin with: new, or the last checkpoint's. A seed axis if --seeds > 1."""
-    import jax
-
-    from mcx_jax.ppo.rollout import layout
-    from mcx_jax.sharding import put
-
-    config, algo = run.config, algorithm(run.config)
-    if config.seeds > 1:
-        keys = jax.vmap(jax.random.key)(jax.numpy.arange(config.seed, config.seed + config.seeds))
-        init = functools.partial(algo.init_seeds, config)
-    else:
-        keys, init = jax.random.key(config.seed), functools.partial(algo.init, config)
-    keys = put(mesh, keys)
-    like = jax.eval_shape(init, env, keys)
-    placed = layout(mesh, like)
-    if run.start_iteration:
-        return jax.device_put(checkpoint.restore_latest(run.path, like), placed)
-    return jax.block_until_ready(jax.jit(init, out_shardings=placed)(env, keys))
-
-
-def compile_iteration(config: TrainConfig, env: Any, state: "TrainState") -> Callable[..., Any]:
-    """The compiled iteration, (env, state) -> (state, metrics); it consumes the old state."""
-    import jax
-
-    algo = algorithm(config)
-    iteration = algo.train_iteration_seeds if config.seeds > 1 else algo.train_iteration
-    placed = jax.tree.map(lambda x: x.sharding, state)
-    jitted = jax.jit(iteration, static_argnums=0, donate_argnums=2, out_shardings=(placed, None))
-    return jitted.lower(config, env, state).compile()
-
-
 def metric_rows(
     config: TrainConfig, iteration: int, metrics: "IterationMetrics"
 ) -> list[dict[str, Any]]:
@@ -223,9 +182,7 @@ def save(run: RunDir, state: "TrainState", rows: list[dict[str, Any]]) -> "tuple
     return policies[best], policies[best].meta.seed
 
 
-def iterate(
-    run: RunDir, env: Any, compiled: Callable[..., Any], state: "TrainState", stop: StopRequest
-) -> "Policy":
+def iterate(run: RunDir, training: "Training", state: "TrainState", stop: StopRequest) -> "Policy":
     """Train to the end, or to the first iteration after a request to stop.
 
     Returns:
@@ -235,7 +192,7 @@ def iterate(
     saved = time.monotonic()
     rows = run.last_rows()
     for iteration in range(run.start_iteration + 1, config.iterations + 1):
-        state, metrics = compiled(env, state)
+        state, metrics = training.iterate(state, iteration - 1)
         rows = metric_rows(config, iteration, metrics)
         run.append([{**row, "wall_s": time.monotonic() - progress.begun} for row in rows])
         progress.show(rows)
@@ -260,28 +217,27 @@ def train(run: RunDir, make_env: Callable[..., Any]) -> "Policy":
         UserError: the arm, the motion or the checkpoint cannot be used.
         SystemExit: stopped by a signal, after saving.
     """
-    import jax
-
-    from mcx_jax.sharding import env_mesh, put
+    from mcx_jax.programs import prepare
 
     config = run.config
     begun = time.monotonic()
-    mesh = env_mesh(config.shards)
-    env = put(mesh, make_env(config.env, config.motion, split="train"))
-    with jax.set_mesh(mesh):
-        state = start(run, env, mesh)
-        ready = time.monotonic()
-        compiled = compile_iteration(config, env, state)
+    env = make_env(config.env, config.motion, split="train")
+    ready = time.monotonic()
+    training = prepare(config, env)
     print(
         f"set-up {short_time(ready - begun)}, compile {short_time(time.monotonic() - ready)}; "
         f"{config.iterations} iterations of {config.num_envs} x {config.iteration_steps} steps",
         flush=True,
     )
+    if run.start_iteration:
+        state = checkpoint.restore_latest(run.path, training.like)
+    else:
+        state = training.start()
     run.create()
     if run.start_iteration:
         print(f"going on after iteration {run.start_iteration}")
     with StopRequest() as stop:
-        policy = iterate(run, env, compiled, state, stop)
+        policy = iterate(run, training, state, stop)
     if stop.signum and policy.meta.iteration < config.iterations:
         print(f"saved; go on with: python -m mcx_jax.train --run-dir {run.path} --resume")
         raise SystemExit(128 + stop.signum)

@@ -80,7 +80,7 @@ def test_quick_writes_the_contract(monkeypatch, tmp_path):
     monkeypatch.setattr(program, "environment_us", lambda *_: 5.0)
     monkeypatch.setattr(program, "training_speed", lambda *_: speed)
     monkeypatch.setattr(program, "matmul_gflops", lambda: 100.0)
-    monkeypatch.setattr(trainer, "init", lambda *_: FakeState())
+    monkeypatch.setattr(program, "reset", lambda *_: None)
     out, plot = tmp_path / "bench.json", tmp_path / "bench.png"
     bench.main(["--quick", "--json", str(out), "--plot", str(plot)])
     figures = json.loads(out.read_text())
@@ -89,20 +89,6 @@ def test_quick_writes_the_contract(monkeypatch, tmp_path):
     assert figures["learner_matmul_share"] == 0.5
     assert {row["engine"] for row in figures["physics"]} == set(engines)
     assert plot.stat().st_size > 10_000
-
-
-@jax.tree_util.register_pytree_node_class
-class FakeState:
-    """A training state of which only the environments' place is read."""
-
-    actors = type("Actors", (), {"env_state": None})
-
-    def tree_flatten(self):
-        return (), None
-
-    @classmethod
-    def tree_unflatten(cls, *_):
-        return cls()
 
 
 @pytest.mark.parametrize(

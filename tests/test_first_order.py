@@ -11,6 +11,8 @@ from probe_envs import make_probe
 from mcx_jax.config import EnvConfig, FirstOrderConfig, TrainConfig, preset_config
 from mcx_jax.errors import UserError
 from mcx_jax.first_order import trainer
+from mcx_jax.programs import prepare
+from mcx_jax.sharding import env_mesh
 
 CONFIG = replace(
     preset_config("fast", "first-order"),
@@ -23,37 +25,33 @@ CONFIG = replace(
 
 
 @pytest.fixture(scope="module")
-def iterate():
-    return jax.jit(trainer.train_iteration, static_argnums=0)
+def training():
+    return prepare(CONFIG, make_probe(), env_mesh(1))
 
 
-def begin(env, seed=0):
-    return jax.jit(trainer.init, static_argnums=0)(CONFIG, env, jax.random.key(seed))
-
-
-def run(iterate, env, iterations=60):
-    state, errors = begin(env), []
-    for _ in range(iterations):
-        state, metrics = iterate(CONFIG, env, state)
+def run(training, env, iterations=60):
+    training = replace(training, env=env)
+    state, errors = training.start(), []
+    for i in range(iterations):
+        state, metrics = training.iterate(state, i)
         errors.append(float(metrics.pos_error_mm) / 1e3)
     return state, metrics, errors
 
 
-def test_learns_to_repeat_what_it_sees(iterate):
-    _, _, errors = run(iterate, make_probe())
+def test_learns_to_repeat_what_it_sees(training):
+    _, _, errors = run(training, make_probe())
     # Targets are uniform in -1..1: the squared error of a zero action is 1/3.
     assert errors[0] > 0.2 and errors[-1] < 0.01, (errors[0], errors[-1])
 
 
-def test_learns_to_remember_what_it_saw_first(iterate):
+def test_learns_to_remember_what_it_saw_first(training):
     """The second window of an episode has only the memory that the first one left."""
-    _, _, errors = run(iterate, make_probe(hold=True), 120)
+    _, _, errors = run(training, make_probe(hold=True), 120)
     assert errors[-1] < 0.1, errors[-1]
 
 
-def test_gradient_equals_a_central_difference():
-    env = make_probe()
-    state = begin(env)
+def test_gradient_equals_a_central_difference(training):
+    env, state = training.env, training.start()
 
     def window(params):
         return trainer.window_gradient(params, CONFIG, env, state.obs_stats, state.actors)[:2]
@@ -70,21 +68,21 @@ def test_gradient_equals_a_central_difference():
     np.testing.assert_allclose(slope, norm, rtol=1e-2)
 
 
-def test_failed_environments_are_never_learned_from(iterate):
-    state, metrics, _ = run(iterate, make_probe(fail_at=5), 3)
+def test_failed_environments_are_never_learned_from(training):
+    state, metrics, _ = run(training, make_probe(fail_at=5), 3)
     assert 0.5 < float(metrics.invalid_share) < 1.0
     assert all(bool(jnp.isfinite(x).all()) for x in jax.tree.leaves(state.learner.policy.params))
     assert bool(jnp.isfinite(state.obs_stats.mean).all())
 
 
-def test_the_chattering_world_gets_a_useful_derivative():
+def test_the_world_gets_a_useful_derivative():
     class World:
         integrator = "euler"
 
         def replace(self, **changes):
             return changes
 
-    assert trainer.training_env(World()) == {"integrator": "straight-through"}
+    assert trainer.training_env(World()) == {"integrator": "euler-smooth"}
 
 
 def test_refuses_what_cannot_be_differentiated():

@@ -300,22 +300,40 @@ def test_gradient_of_ten_steps():
     assert np.all(np.abs(slope).reshape(4, 6).max(1) > 1e-3)
 
 
-def test_straight_through_is_eulers_value_and_implicitfasts_derivative():
-    model = chain_model(load_mujoco("paper"))
-    x = np.concatenate([a[0].ravel() for a in random_states(1, seed=8)[:3]])
+@pytest.mark.parametrize("integrator", ["euler", "implicitfast"])
+def test_smooth_is_the_value_of_one_and_the_derivative_of_unlimited_servos(integrator):
+    """Also where both servos are at their limits, and their own derivative by the command is 0."""
+    mj = load_mujoco("paper")
+    model = chain_model(mj)
+    mj.actuator_forcelimited[:] = mj.actuator_ctrllimited[:] = 0
+    unlimited = chain_model(mj)
+    q, qd, ctrl = (a[0].ravel() for a in random_states(1, seed=8)[:3])
+    small = np.concatenate([q + 1e-7, q * 0, q, q * 0])  # no servo at its limit
+    large = np.concatenate([q, qd, ctrl])
 
-    def all_three(x):
-        value = {
-            name: weighted(functools.partial(chain.substeps, model, name), 1)
-            for name in ("euler", "implicitfast", "straight-through")
-        }
-        slopes = [jax.grad(value[name])(x) for name in ("straight-through", "implicitfast")]
-        return value["straight-through"](x), value["euler"](x), *slopes
+    def step(model, name):
+        return weighted(functools.partial(chain.substeps, model, name), 1)
+
+    def slope_and_value(x):
+        value = {name: step(model, name) for name in (integrator, f"{integrator}-smooth")}
+        return (
+            value[f"{integrator}-smooth"](x) - value[integrator](x),
+            jax.grad(value[f"{integrator}-smooth"])(x),
+            jax.grad(step(unlimited, "implicitfast"))(x),
+        )
 
     with jax.enable_x64(True):
-        got, want, slope, want_slope = jax.jit(all_three, compiler_options=arms.QUICK)(x)
-    np.testing.assert_allclose(got, want, rtol=1e-12)
-    np.testing.assert_allclose(slope, want_slope, rtol=1e-12, atol=1e-12)
+        run = jax.jit(slope_and_value, compiler_options=arms.QUICK)
+        for x in (small, large):
+            difference, slope, want = run(x)
+            assert difference == 0.0
+            # By the commands the derivative does not depend on the accelerations: equal anywhere.
+            np.testing.assert_allclose(slope[12:], want[12:], rtol=1e-9, atol=1e-12)
+            assert np.all(np.abs(slope[12:18]) > 0)
+        difference, slope, want = run(small)
+        # The rest is the derivative at the acceleration that is the value's: implicitfast's own.
+        if integrator == "implicitfast":
+            np.testing.assert_allclose(slope, want, rtol=1e-9, atol=1e-12)
 
 
 def test_the_random_states_reach_the_limits_of_both_servos():

@@ -16,7 +16,7 @@ from mcx_jax.ppo.loss import (
     standardise,
     value_loss,
 )
-from mcx_jax.ppo.sequences import flatten_starts, minibatch_order, to_sequences
+from mcx_jax.ppo.sequences import flatten_starts, minibatch_order, take, to_sequences
 
 
 @pytest.fixture(autouse=True)
@@ -154,18 +154,30 @@ def test_chunks_keep_their_order():
     for k in range(3):
         for env in range(3):
             expected = [100 * (2 * k) + env, 100 * (2 * k + 1) + env]
-            assert chunks[:, 3 * k + env].tolist() == expected
+            assert chunks[:, 3 * env + k].tolist() == expected
     starts = flatten_starts(jnp.asarray(100 * t + n)[::2])
     assert starts.tolist() == chunks[0].tolist()
 
 
 def test_minibatches_hold_every_sequence_once_an_epoch():
-    order = np.asarray(minibatch_order(jax.random.key(0), 12, 3, 4))
-    assert order.shape == (12, 3)
-    epochs = order.reshape(3, 12)
+    # 12 sequences in 2 shards, 3 epochs, 3 minibatches: 2 sequences of each shard in each.
+    order = np.asarray(minibatch_order(jax.random.key(0), 12, 3, 3, 2))
+    assert order.shape == (9, 2, 2)
+    data = jnp.arange(12)
+    epochs = [
+        np.concatenate([take(data, jnp.asarray(chosen), 0) for chosen in epoch])
+        for epoch in order.reshape(3, 3, 2, 2)
+    ]
     for epoch in epochs:
         assert sorted(epoch.tolist()) == list(range(12))
     assert not np.array_equal(epochs[0], epochs[1])
+
+
+def test_a_minibatch_takes_whole_sequences():
+    # Entry 100 t + n: step t of sequence n; 2 shards of 3 sequences.
+    data = jnp.asarray(100 * np.arange(4)[:, None] + np.arange(6))
+    got = take(data, jnp.array([[2, 0], [1, 1]]), 1)
+    np.testing.assert_array_equal(got, 100 * np.arange(4)[:, None] + [2, 0, 4, 4])
 
 
 def _merged(batches, masks=None):

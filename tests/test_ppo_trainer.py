@@ -1,5 +1,6 @@
 """The compiled training iteration on probe environments: one program serves nearly all tests."""
 
+import functools
 from dataclasses import replace
 
 import jax
@@ -12,8 +13,10 @@ from mcx_jax.config import EnvConfig, PPOConfig, TrainConfig
 from mcx_jax.ppo import trainer
 from mcx_jax.ppo.networks import init_carry, init_params, step
 from mcx_jax.ppo.normalise import RunningStats, denormalise
-from mcx_jax.ppo.rollout import init_actors, reset_block
+from mcx_jax.ppo.rollout import init_actors, insert_block, reset_all
 from mcx_jax.ppo.update import gradient_step, init_fitted
+from mcx_jax.programs import prepare, reset
+from mcx_jax.sharding import env_mesh
 
 CONFIG = TrainConfig(
     num_envs=64,
@@ -34,22 +37,18 @@ CONFIG = TrainConfig(
         reject_mean_sq_reward=100.0,
     ),
 )
-TRACES = []
 
 
-def _counted(config, env, state):
-    TRACES.append(config)
-    return trainer.train_iteration(config, env, state)
-
-
-INIT = jax.jit(trainer.init, static_argnums=0)
-ITERATE = jax.jit(_counted, static_argnums=0)
+@functools.cache
+def _training(config):
+    return prepare(config, make_probe(), env_mesh(1))
 
 
 def _train(env, iterations, config=CONFIG, seed=0):
-    state, rows = INIT(config, env, jax.random.key(seed)), []
-    for _ in range(iterations):
-        state, metrics = ITERATE(config, env, state)
+    training = replace(_training(config), env=env, seeds=jnp.int32(seed))
+    state, rows = training.start(), []
+    for i in range(iterations):
+        state, metrics = training.iterate(state, i)
         rows.append(metrics)
     return state, rows
 
@@ -61,13 +60,6 @@ def test_first_ratio_is_one_across_windows_and_resets():
     for metrics in rows:
         assert float(metrics.first_ratio_deviation) < 1e-5
         assert float(metrics.policy_steps) > 0  # so the weights do change in between
-
-
-def test_traced_once():
-    before = len(TRACES)
-    _train(make_probe(), 3, seed=1)
-    _train(make_probe(delay=2), 1, seed=2)
-    assert len(TRACES) == max(before, 1)
 
 
 def test_value_of_a_constant_reward():
@@ -122,54 +114,65 @@ def test_kl_stop():
 def test_seeds_in_one_call_are_the_single_seeds():
     """Not bit for bit: batched products sum in another order. After two iterations (16 Adam steps,
     the first of which amplify rounding: m / sqrt(v)) weights of size 0.1 agree within 1e-3."""
-    env, keys = make_probe(), jax.random.split(jax.random.key(5), 2)
-    states = jax.jit(trainer.init_seeds, static_argnums=0)(CONFIG, env, keys)
-    together = jax.jit(trainer.train_iteration_seeds, static_argnums=0)
-    for _ in range(2):
-        states, metrics = together(CONFIG, env, states)
+    together = prepare(replace(CONFIG, seed=5, seeds=2), make_probe(), env_mesh(1))
+    states = together.start()
+    for i in range(2):
+        states, metrics = together.iterate(states, i)
     for k in range(2):
-        state = INIT(CONFIG, env, keys[k])
-        for _ in range(2):
-            state, single = ITERATE(CONFIG, env, state)
+        state, rows = _train(make_probe(), 2, seed=5 + k)
         jax.tree.map(
             lambda a, b: np.testing.assert_allclose(a[k], b, atol=1e-3),  # noqa: B023
             states.learner.policy.params,
             state.learner.policy.params,
         )
-        np.testing.assert_allclose(metrics.reward[k], single.reward, rtol=1e-3)
+        np.testing.assert_allclose(metrics.reward[k], rows[-1].reward, rtol=1e-3)
     assert float(metrics.reward[0]) != float(metrics.reward[1])
 
 
 def test_no_lapack():
     """jaxlib's batched LAPACK calls can wait for each other for ever (see `lstm`), so there must be
     none in a program of several seeds."""
-    env, keys = make_probe(), jax.random.split(jax.random.key(5), 2)
-    first = jax.jit(trainer.init_seeds, static_argnums=0)
-    states = jax.eval_shape(first, CONFIG, env, keys)
-    iteration = jax.jit(trainer.train_iteration_seeds, static_argnums=0)
-    for lowered in (first.lower(CONFIG, env, keys), iteration.lower(CONFIG, env, states)):
-        assert "lapack" not in lowered.as_text()
+    env, seeds = make_probe(), jnp.arange(2)
+    fresh = jax.vmap(lambda seed: reset(CONFIG, env, seed, jnp.int32(0)))
+    init = jax.vmap(lambda seed, blocks: trainer.init(CONFIG, env, seed, blocks))
+    iterate = jax.vmap(lambda state, fresh: trainer.iterate(CONFIG, env, state, fresh))
+    blocks = [jax.eval_shape(fresh, seeds)] * CONFIG.reset_groups
+    states = jax.eval_shape(init, seeds, blocks)
+    programs = (fresh, seeds), (init, seeds, blocks), (iterate, states, blocks[0])
+    for function, *arguments in programs:
+        assert "lapack" not in jax.jit(function).lower(*arguments).as_text()
 
 
-def test_blocks_cover_all_environments():
-    """G = 4 windows, 10 environments: blocks of 3 that start at 0, 2, 5, 7; N = 2 < G too."""
+@pytest.mark.parametrize(
+    ("num_envs", "shards", "starts", "size"),
+    [
+        (10, 1, [0, 2, 5, 7], 3),  # G = 4 does not divide N: neighbours overlap
+        (2, 1, [0, 0, 1, 1], 1),  # N < G
+        (8, 2, [0, 1, 2, 3], 1),  # two shards of four: environments i and 4 + i
+        (10, 2, [0, 1, 2, 3], 2),  # two shards of five
+    ],
+)
+def test_blocks_cover_all_environments(num_envs, shards, starts, size):
     nets = trainer.networks_of(CONFIG.ppo, 2)
-    reset = jax.jit(reset_block, static_argnums=4)
     env = make_probe()
-    for num_envs, starts, size in ((10, [0, 2, 5, 7], 3), (2, [0, 0, 1, 1], 1)):
-        actors = init_actors(env, nets, jax.random.key(0), num_envs)
-        actors = actors.replace(
-            env_state=actors.env_state.replace(t=jnp.full((num_envs,), 9)),
-            policy_carry=jax.tree.map(jnp.ones_like, actors.policy_carry),
-            value_carry=jax.tree.map(jnp.ones_like, actors.value_carry),
-        )
-        for i in range(8):
-            after = reset(env, actors, jax.random.key(i), jnp.int32(i), 4)
-            expected = np.zeros(num_envs, bool)
-            expected[starts[i % 4] : starts[i % 4] + size] = True
-            assert ((np.asarray(after.env_state.t) == 0) == expected).all()
-            for carry in (after.policy_carry.h, after.policy_carry.c, after.value_carry.h):
-                assert ((np.asarray(carry) == 0).all(axis=1) == expected).all()
+    blocks = [reset_all(env, jax.random.key(i), shards * size) for i in range(4)]
+    actors = init_actors(nets, blocks, num_envs, shards)
+    assert actors.env_state.obs.shape == (4, num_envs)
+    old = actors.replace(
+        env_state=actors.env_state.replace(t=jnp.full((num_envs,), 9)),
+        policy_carry=jax.tree.map(jnp.ones_like, actors.policy_carry),
+        value_carry=jax.tree.map(jnp.ones_like, actors.value_carry),
+    )
+    insert = jax.jit(insert_block, static_argnums=(3, 4))
+    for i in range(8):
+        after = insert(old, blocks[i % 4], jnp.int32(i), 4, shards)
+        expected = np.zeros((shards, num_envs // shards), bool)
+        expected[:, starts[i % 4] : starts[i % 4] + size] = True
+        expected = expected.ravel()
+        assert ((np.asarray(after.env_state.t) == 0) == expected).all()
+        np.testing.assert_array_equal(after.env_state.obs[:, expected], blocks[i % 4].obs)
+        for carry in (after.policy_carry.h, after.policy_carry.c, after.value_carry.h):
+            assert ((np.asarray(carry) == 0).all(axis=1) == expected).all()
 
 
 def test_gradient_that_is_not_finite_is_left_out():

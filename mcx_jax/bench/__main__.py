@@ -46,15 +46,11 @@ def run(quick: bool, say) -> dict[str, Any]:
         say: prints a line of progress.
     """
     from dataclasses import asdict
-    from functools import partial
-
-    import jax
 
     from mcx_jax.bench import physics, program, startup_time
     from mcx_jax.bench.timing import REPEATS
     from mcx_jax.config import TrainConfig
     from mcx_jax.envs.v2v import make_env
-    from mcx_jax.ppo import trainer
 
     figures: dict[str, Any] = {"device": machine.device(), "versions": machine.versions()}
     figures["physics"] = rows = []
@@ -71,23 +67,21 @@ def run(quick: bool, say) -> dict[str, Any]:
 
     config = TrainConfig()
     env = make_env(config.env, config.motion)
-    state = jax.jit(partial(trainer.init, config))(env, jax.random.key(0))
     figures["environment"] = []
     for envs in (config.num_envs,) if quick else ENVIRONMENT_ENVS:
-        at_start = state.actors.env_state if envs == config.num_envs else program.reset(env, envs)
-        us = program.environment_us(env, at_start)
+        us = program.environment_us(env, program.reset(env, envs))
         figures["environment"].append({"envs": envs, "steps_per_s": 1e6 / us, "us_per_step": us})
         say(f"environment, {envs} environments: {1e6 / us:,.0f} control steps/s ({us:.2f} us)")
     speeds = {row["envs"]: row["steps_per_s"] for row in figures["environment"]}
     figures["environment_steps_per_s"] = speeds[config.num_envs]
     if not quick:
-        figures["breakdown_us"] = program.breakdown_us(env, state.actors.env_state)
+        figures["breakdown_us"] = program.breakdown_us(env, program.reset(env, config.num_envs))
         parts = ", ".join(f"{name} {us:.2f}" for name, us in figures["breakdown_us"].items())
         say(f"parts of a control step alone, us: {parts}")
     figures["peak_memory_gib"] = peak_memory_gib()
     say(f"peak memory so far, no learner: {figures['peak_memory_gib']:.2f} GiB")
 
-    speed = program.training_speed(config, env, state, 3 if quick else REPEATS)
+    speed = program.training_speed(config, env, 3 if quick else REPEATS)
     figures.update(asdict(speed))
     figures["matmul_gflops"] = program.matmul_gflops()
     figures["learner_matmul_share"] = speed.learner_gflops / figures["matmul_gflops"]

@@ -8,6 +8,7 @@ angles; what one control step asks of the physics, ten steps of 2 ms, is the uni
 import os
 from collections.abc import Callable
 from functools import partial
+from importlib.metadata import version
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,8 @@ from mcx_jax.bench.timing import median_s
 from mcx_jax.config import SUBSTEPS
 from mcx_jax.envs import chain
 from mcx_jax.envs.model import ChainModel, chain_model, load_mujoco
+from mcx_jax.sharding import env_mesh, put
+from mcx_jax.startup import needs_old_emitters
 
 AT_REST = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 9.81))
 """`chain.BaseState` of a level base at rest."""
@@ -79,19 +82,28 @@ def mjx(envs: int) -> float:
         d = jax.lax.fori_loop(0, SUBSTEPS, lambda _, d: mj_x.step(m, d), d)
         return d.qpos, d.qvel
 
-    q, ctrl = (jnp.asarray(x, jnp.float32) for x in start(model, envs))
-    step = jax.jit(jax.vmap(run))
-    return envs * SUBSTEPS / _jax_s(step, (q, jnp.zeros_like(q)), ctrl)
+    q, ctrl = (np.asarray(x, np.float32) for x in start(model, envs))
+    arrays = put(env_mesh(envs), (q, np.zeros_like(q), ctrl), 0)
+    old_emitters = jax.default_backend() == "cpu" and needs_old_emitters(version("jaxlib"))
+    options = {"xla_cpu_use_fusion_emitters": False} if old_emitters else None
+    return envs * SUBSTEPS / _jax_s(jax.jit(jax.vmap(run), compiler_options=options), *arrays)
 
 
 def chain_engine(envs: int) -> float:
     """Physics steps/s of this project's engine."""
-    mj = load_mujoco("paper")
-    q, ctrl = (jnp.asarray(x.T, jnp.float32) for x in start(mj, envs))
+    model, arrays = _chain_start(envs)
     steps = _steps_a_call(envs, LARGE_STEPS)
-    wall = jnp.asarray(True) if jax.default_backend() == "cpu" else None
-    step = jax.jit(partial(_chain_steps, chain_model(mj, "tool"), "euler", steps))
-    return envs * steps / _jax_s(step, (q, jnp.zeros_like(q)), ctrl, wall)
+    step = jax.jit(partial(_chain_steps, model, "euler", steps))
+    return envs * steps / _jax_s(step, *arrays)
+
+
+def _chain_start(envs: int) -> tuple[ChainModel, tuple]:
+    """(model, (q, qd, ctrl, wall)), environments on the last axis, over the devices."""
+    mj = load_mujoco("paper")
+    mesh = env_mesh(envs)
+    q, ctrl = (np.asarray(x.T, np.float32) for x in start(mj, envs))
+    wall = put(mesh, jnp.asarray(True)) if jax.default_backend() == "cpu" else None
+    return chain_model(mj, "tool"), (*put(mesh, (q, np.zeros_like(q), ctrl), -1), wall)
 
 
 ENGINES: dict[str, Callable[[int], float]] = {
@@ -105,18 +117,15 @@ ENGINES: dict[str, Callable[[int], float]] = {
 def gradient_over_forward(envs: int) -> float:
     """Time of the gradient of ten physics steps (implicitfast) by the state over the time of the
     steps themselves."""
-    mj = load_mujoco("paper")
-    q, ctrl = (jnp.asarray(x.T, jnp.float32) for x in start(mj, envs))
-    v = jnp.zeros_like(q)
-    wall = jnp.asarray(True) if jax.default_backend() == "cpu" else None
-    run = partial(_chain_steps, chain_model(mj, "tool"), "implicitfast", SUBSTEPS)
+    model, arrays = _chain_start(envs)
+    run = partial(_chain_steps, model, "implicitfast", SUBSTEPS)
 
     def loss(q, v, ctrl, wall):
         q, v = run(q, v, ctrl, wall)
         return jnp.sum(q**2) + jnp.sum(v**2)
 
-    forward = _jax_s(jax.jit(run), (q, v), ctrl, wall)
-    return _jax_s(jax.jit(jax.grad(loss, argnums=(0, 1))), (q, v), ctrl, wall) / forward
+    forward = _jax_s(jax.jit(run), *arrays)
+    return _jax_s(jax.jit(jax.grad(loss, argnums=(0, 1))), *arrays) / forward
 
 
 def _chain_steps(model: ChainModel, integrator: str, steps: int, q, v, ctrl, wall):
@@ -133,6 +142,6 @@ def _steps_a_call(envs: int, at_least: int) -> int:
     return SUBSTEPS * max(1, at_least // (SUBSTEPS * envs))
 
 
-def _jax_s(step: Callable, state: tuple, *constants) -> float:
-    """Median seconds of `step(*state, *constants)`, from the same state each time."""
-    return median_s(lambda: jax.block_until_ready(step(*state, *constants)))
+def _jax_s(step: Callable, *arrays) -> float:
+    """Median seconds of `step(*arrays)`."""
+    return median_s(lambda: jax.block_until_ready(step(*arrays)))

@@ -14,16 +14,24 @@ from mcx_jax.envs.v2v import ArmState, EnvState, V2VEnv
 from mcx_jax.ppo import rollout, trainer
 from mcx_jax.ppo.experience import judge
 from mcx_jax.ppo.update import learn
+from mcx_jax.programs import prepare
+from mcx_jax.sharding import env_mesh, put
 from mcx_jax.spatial import unpack, unpack_matrix
 from mcx_jax.stage import stage
 
+RESET_ENVS = 256
 STEPS = 10
 """Control steps in a timed call of the environment."""
 
 
 def reset(env: V2VEnv, envs: int) -> EnvState:
-    """Environments at the start of an episode, leaves (..., envs)."""
-    return jax.jit(partial(rollout.reset_all, num_envs=envs))(env, jax.random.key(0))
+    """Environments at the start of an episode, over the devices, leaves (..., envs).
+
+    A few different ones, repeated: compiled once for all sizes.
+    """
+    few = jax.jit(rollout.reset_all, static_argnums=2)(env, jax.random.key(0), RESET_ENVS)
+    repeated = jax.tree.map(lambda x: jnp.concatenate([x] * (envs // RESET_ENVS), -1), few)
+    return put(env_mesh(envs), repeated, -1)
 
 
 def breakdown_us(env: V2VEnv, state: EnvState) -> dict[str, float]:
@@ -35,7 +43,8 @@ def breakdown_us(env: V2VEnv, state: EnvState) -> dict[str, float]:
 def environment_us(env: V2VEnv, state: EnvState, step=V2VEnv.step) -> float:
     """Microseconds of one control step of one environment, no policy."""
     envs = state.step.shape[0]
-    action = jnp.zeros((6,))
+    mesh = env_mesh(envs)
+    env, action = put(mesh, (env, jnp.zeros((6,))))
 
     def many(env, state):
         one = jax.vmap(partial(step, env), in_axes=(-1, None), out_axes=-1)
@@ -90,37 +99,45 @@ class TrainingSpeed:
     """Useful floating-point operations of the learner's matrix products, 1e9/s."""
 
 
-def training_speed(
-    config: TrainConfig, env: V2VEnv, state: trainer.TrainState, repeats: int
-) -> TrainingSpeed:
+def training_speed(config: TrainConfig, env: V2VEnv, repeats: int) -> TrainingSpeed:
     """Time the rollout, the learner and the whole iteration of PPO."""
     # The KL stop would skip policy steps: here every planned step is computed.
     config = replace(config, ppo=replace(config.ppo, target_kl=1e6))
     ppo, nets = config.ppo, trainer.networks_of(config.ppo, env.action_size)
-    key = jax.random.key(1)
-    keys = trainer._step_keys(ppo, key)
-    policy, value = state.learner.policy.params, state.learner.value.params
+    mesh = env_mesh(config.shards)
+    training = prepare(config, env, mesh)
+    env, key = training.env, put(mesh, jax.random.key(1))
+    state = training.start()
 
     @jax.jit
-    def collect(env, actors):
-        return rollout.collect(env, nets, policy, state.obs_stats, actors, keys)
+    def collect(env, state, key):
+        params = state.learner.policy.params
+        return rollout.collect(
+            env, nets, params, state.obs_stats, state.actors, trainer._step_keys(ppo, key)
+        )
 
     @jax.jit
-    def prepare(window):
-        carry = state.actors.value_carry
+    def prepare_batch(state, window):
+        value, carry = state.learner.value.params, state.actors.value_carry
         return judge(ppo, nets, value, carry, state.obs_stats, state.value_stats, window).batch
 
     @jax.jit
-    def learn_once(learner, batch):
+    def learn_once(learner, batch, key):
         rates = jnp.float32(ppo.policy_lr), jnp.float32(ppo.value_lr)
         return learn(ppo, nets, rates, learner, batch, key, config.shards)
 
+    def iterate():
+        nonlocal state
+        state, metrics = training.iterate(state, 0)
+        jax.block_until_ready(metrics)
+
     steps = config.steps_per_iteration
-    rollout_s = median_s(lambda: jax.block_until_ready(collect(env, state.actors)), repeats)
-    batch = prepare(collect(env, state.actors)[1])
-    learn_s = median_s(lambda: jax.block_until_ready(learn_once(state.learner, batch)), repeats)
-    iterate = jax.jit(partial(trainer.train_iteration, config))
-    iteration_s = median_s(lambda: jax.block_until_ready(iterate(env, state)), repeats)
+    with jax.set_mesh(mesh):
+        rollout_s = median_s(lambda: jax.block_until_ready(collect(env, state, key)), repeats)
+        batch = prepare_batch(state, collect(env, state, key)[1])
+        learner = state.learner
+        learn_s = median_s(lambda: jax.block_until_ready(learn_once(learner, batch, key)), repeats)
+    iteration_s = median_s(iterate, repeats)
     flops = steps * ppo.epochs * learner_flops(env.obs_size, ppo.hidden, (env.action_size, 1))
     return TrainingSpeed(
         rollout_steps_per_s=steps / rollout_s,

@@ -95,7 +95,7 @@ class V2VEnv:
     model: ChainModel = struct.field(pytree_node=False)
     delay: Delay = struct.field(pytree_node=False)
     integrator: str = struct.field(pytree_node=False)
-    """euler, implicitfast, or straight-through (chain engine; value euler, slope implicitfast)."""
+    """euler or implicitfast, with the chain engine also euler-smooth or implicitfast-smooth."""
     episode_steps: int = struct.field(pytree_node=False)
 
     @property

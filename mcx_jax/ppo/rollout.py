@@ -5,14 +5,16 @@ and actions are transposed where the two meet. Environment states and the networ
 on from window to window.
 
 Resets are staggered. An episode has E steps, a window T, so G = E / T windows make an episode and
-the environments form G blocks. At the START of window i the block i mod G is reset and nothing is
-reset inside a window: no step pays for a reset, no `cond` runs two branches under `vmap`, and all
-phases of an episode are in every window. A window's end is a truncation, not an end: the value of
-the last observation follows. Where G does not divide N, or N < G, neighbouring blocks share an
-environment, which is then reset earlier than need be: a shorter episode, otherwise harmless. Each of S shards (`sharding`) has
-its own G blocks, so that resetting moves nothing between devices.
+the environments form G blocks. At the START of window i the block i mod G is replaced by fresh
+environments (made by a program of their own, see `programs`) and nothing is reset inside a window:
+no step pays for a reset, no `cond` runs two branches under `vmap`, and all phases of an episode are
+in every window. A window's end is a truncation, not an end: the value of the last observation
+follows. Where G does not divide N, or N < G, neighbouring blocks share an environment, which is
+then reset earlier than need be: a shorter episode, otherwise harmless. Each of S shards
+(`sharding`) has G blocks of its own, so that resetting moves nothing between devices.
 """
 
+import itertools
 from dataclasses import replace
 from typing import Any
 
@@ -100,30 +102,47 @@ def step_all(env: Any, env_state: Any, action: jax.Array) -> Any:
     return jax.vmap(env.step, in_axes=(-1, -1), out_axes=-1)(env_state, action.T)
 
 
-def init_actors(env: Any, nets: Networks, key: jax.Array, num_envs: int) -> Actors:
-    """All environments reset, all memories empty."""
+def init_actors(nets: Networks, blocks: list[Any], num_envs: int, shards: int) -> Actors:
+    """N environments from G blocks of fresh ones; all memories empty.
+
+    Args:
+        blocks: G times leaves (..., S * n), in the order of `insert_block`.
+        num_envs: N.
+    """
+    bounds = [i * (num_envs // shards) // len(blocks) for i in range(len(blocks) + 1)]
+    widths = [end - start for start, end in itertools.pairwise(bounds)]
+    size = blocks[0].obs.shape[-1] // shards
+
+    def join(*leaves: jax.Array) -> jax.Array:
+        parts = [
+            over_envs(x.reshape(*x.shape[:-1], shards, size)[..., :width], -2)
+            for x, width in zip(leaves, widths, strict=True)
+        ]
+        return over_envs(jnp.concatenate(parts, -1).reshape(*leaves[0].shape[:-1], num_envs), -1)
+
     return Actors(
-        env_state=reset_all(env, key, num_envs),
+        env_state=jax.tree.map(join, *blocks),
         policy_carry=over_envs(init_carry(nets.policy, (num_envs,)), 0),
         value_carry=over_envs(init_carry(nets.value, (num_envs,)), 0),
     )
 
 
-def reset_block(
-    env: Any, actors: Actors, key: jax.Array, iteration: jax.Array, groups: int, shards: int
+def insert_block(
+    actors: Actors, fresh: Any, iteration: jax.Array, groups: int, shards: int
 ) -> Actors:
-    """Reset one of `groups` blocks of environments, in each shard, and empty its memories.
+    """Put fresh environments in the place of one of `groups` blocks in each shard, and empty the
+    memories there.
 
     Args:
         actors: of N environments.
-        iteration: number of the window, (); block iteration mod groups is reset.
+        fresh: environments just reset, leaves (..., S * n).
+        iteration: number of the window, (); block iteration mod groups is replaced.
         groups: G, windows in an episode.
         shards: S, divides N.
     """
     envs = actors.env_state.obs.shape[-1] // shards
-    size = -(-envs // groups)
+    size = fresh.obs.shape[-1] // shards
     start = (iteration % groups) * envs // groups
-    fresh = reset_all(env, key, shards * size)
 
     def last(old: jax.Array, new: jax.Array) -> jax.Array:
         parts = over_envs(old.reshape(*old.shape[:-1], shards, envs), -2)

@@ -1,10 +1,7 @@
-"""One training iteration, rollout and learning in one pure function.
-
-    state = init(config, env, key)
-    state, metrics = jax.jit(train_iteration, static_argnums=0)(config, env, state)
+"""One training iteration, rollout and learning in one pure function (run by `mcx_jax.programs`).
 
 `env` is an argument (it holds the sea's tables; closed over, they would be baked into the program).
-Several seeds are an outer `vmap` over the state (`init_seeds`, `train_iteration_seeds`).
+Several seeds are an outer `vmap` over the state.
 """
 
 from dataclasses import replace
@@ -19,7 +16,7 @@ from mcx_jax.ppo.experience import Judged, judge
 from mcx_jax.ppo.loss import masked_mean
 from mcx_jax.ppo.networks import Networks, init_params, make_networks
 from mcx_jax.ppo.normalise import RunningStats, init_stats, merge
-from mcx_jax.ppo.rollout import Actors, Window, collect, init_actors, reset_block
+from mcx_jax.ppo.rollout import Actors, Window, collect, init_actors, insert_block
 from mcx_jax.ppo.update import Learner, UpdateStats, init_fitted, learn
 
 VALUE_KEEP = 0.9
@@ -98,13 +95,18 @@ def networks_of(config: PPOConfig, action_size: int) -> Networks:
     return make_networks(config.hidden, config.initial_sigma, action_size)
 
 
-def init(config: TrainConfig, env: Any, key: jax.Array) -> TrainState:
-    """First weights, all environments reset, observation statistics from the first observations."""
+def init(config: TrainConfig, env: Any, seed: jax.Array, blocks: list[Any]) -> TrainState:
+    """First weights; observation statistics from the first observations.
+
+    Args:
+        seed: () int32.
+        blocks: fresh environments for all blocks, see `rollout.init_actors`.
+    """
     ppo, nets = config.ppo, networks_of(config.ppo, env.action_size)
-    key, policy_key, value_key, env_key = jax.random.split(key, 4)
+    key, policy_key, value_key = jax.random.split(jax.random.key(seed), 3)
     policy = init_params(nets.policy, policy_key, env.obs_size)
     value = init_params(nets.value, value_key, env.obs_size)
-    actors = init_actors(env, nets, env_key, config.num_envs)
+    actors = init_actors(nets, blocks, config.num_envs, config.shards)
     first_obs = actors.env_state.obs.T
     finite = jnp.all(jnp.isfinite(first_obs), axis=1).astype(jnp.float32)
     return TrainState(
@@ -128,19 +130,22 @@ def learning_rate(config: TrainConfig, first: float, iteration: jax.Array) -> ja
     return first * (COSINE_END + (1 - COSINE_END) * 0.5 * (1 + jnp.cos(jnp.pi * progress)))
 
 
-def train_iteration(
-    config: TrainConfig, env: Any, state: TrainState
+def iterate(
+    config: TrainConfig, env: Any, state: TrainState, fresh: Any
 ) -> tuple[TrainState, IterationMetrics]:
-    """Collect one window from every environment and learn from it.
+    """Renew one block of environments, collect one window from every environment, learn from it.
+
+    Args:
+        fresh: environments just reset, leaves (..., block_envs).
 
     The statistics of observations and value targets are frozen during the iteration, so that
     rollout and learning see the same numbers and the first ratio is 1; they are merged at its end.
     """
     ppo, nets = config.ppo, networks_of(config.ppo, env.action_size)
-    key, reset_key, act_key, order_key = jax.random.split(state.key, 4)
+    key, act_key, order_key = jax.random.split(state.key, 3)
     with jax.named_scope("rollout"):
-        actors = reset_block(
-            env, state.actors, reset_key, state.iteration, config.reset_groups, config.shards
+        actors = insert_block(
+            state.actors, fresh, state.iteration, config.reset_groups, config.shards
         )
         act_keys = _step_keys(ppo, act_key)
         params = state.learner.policy.params
@@ -222,15 +227,3 @@ def _metrics(
         first_ratio_deviation=stats.surrogate.ratio_deviation[0],
         lr=lr,
     )
-
-
-def init_seeds(config: TrainConfig, env: Any, keys: jax.Array) -> TrainState:
-    """One state per key, on a new leading axis."""
-    return jax.vmap(lambda key: init(config, env, key))(keys)
-
-
-def train_iteration_seeds(
-    config: TrainConfig, env: Any, states: TrainState
-) -> tuple[TrainState, IterationMetrics]:
-    """`train_iteration` of several seeds at once: states and metrics have a leading seed axis."""
-    return jax.vmap(lambda state: train_iteration(config, env, state))(states)
