@@ -49,7 +49,8 @@ def headline() -> str:
             ["IK baseline against table 3's implied one, 40 cells", value, source(cells[0])]
         )
     for name, label in (("train_2m", "PPO"), ("first_order", "gradient through the simulator")):
-        found = {(r["who"] == "ik", r["sea"]): r for r in read(name)}
+        stored = [r for r in read(name) if r["delay"] == "B4_4"]
+        found = {(r["who"] == "ik", r["sea"]): r for r in stored}
         if not found:
             continue
         gains = [
@@ -87,7 +88,8 @@ def controllers() -> str:
     for name in ("baseline_ik", "baseline_extrapolate", "baseline_preview"):
         everyone += [r for r in read(name) if r["delay"] == "B4_4"]
     for name in ("train_2m", "first_order"):
-        everyone += [{**r, "trained": r["steps"]} for r in read(name) if r["who"] != "ik"]
+        trained = [r for r in read(name) if r["who"] != "ik" and r["delay"] == "B4_4"]
+        everyone += [{**r, "trained": r["steps"]} for r in trained]
     if not everyone:
         return "not measured yet (`python experiments/baseline.py ik extrapolate preview`)"
     rows = []
@@ -110,6 +112,28 @@ def controllers() -> str:
         rows.append(["paper's agents, 20 M steps", *paper])
     commands = "; ".join({r["command"]: source(r) for r in everyone}.values())
     return markdown(["B4_4", *SEAS], rows) + "\n\nSource: " + commands
+
+
+def first_order() -> str:
+    """First-order agents of all delays beside the paper's agents, both worlds."""
+    blocks = []
+    for name, world in (
+        ("first_order", "the paper's world"),
+        ("first_order_quiet", "implicitfast"),
+    ):
+        cells = {(r["delay"], r["sea"]): r for r in read(name) if r["who"] != "ik"}
+        rows = []
+        for delay in dict.fromkeys(delay for delay, _ in cells):
+            row = [delay]
+            for unit in ("pos_mm", "ang_mrad"):
+                mine = [cells[delay, s] for s in SEAS]
+                row += [f"{float(r[unit]):.2f} / {r[unit + '_paper']}" for r in mine]
+            rows.append([*row, f"{float(mine[0]['train_seconds']) / 60:.1f} min"])
+        if rows:
+            header = [world, *(f"{s} mm" for s in SEAS), *(f"{s} mrad" for s in SEAS), "trained"]
+            first = next(iter(cells.values()))
+            blocks.append(markdown(header, rows) + "\n\nSource: " + source(first))
+    return "\n\n".join(blocks) or "not measured yet (`python experiments/first_order.py`)"
 
 
 def speed() -> str:
@@ -185,6 +209,7 @@ TABLES = {
     "headline": headline,
     "baseline": baseline,
     "controllers": controllers,
+    "first_order": first_order,
     "speed": speed,
     "observation": observation,
     "presets": presets,

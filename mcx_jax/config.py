@@ -155,7 +155,7 @@ class PPOConfig:
     """Length of back-propagation through time; divides window_steps."""
     epochs: int = 2
     """Passes over the collected window in one iteration (policy and value at most that many)."""
-    minibatches: int = 8
+    minibatches: int = 16
     """Minibatches of whole sequences per pass."""
     gamma: float = 0.9
     """Discount per control step."""

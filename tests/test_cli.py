@@ -40,8 +40,8 @@ def test_flags_are_flat():
         (
             "--num-envs 12",
             (
-                "--num-envs 12 gives 12 sequences a window, which --minibatches 8 does not "
-                "divide; use a multiple of 8"
+                "--num-envs 12 gives 12 sequences a window, which --minibatches 16 does not "
+                "divide; use a multiple of 16"
             ),
         ),
         (

@@ -127,7 +127,7 @@ def _accelerations_backward(model, integrator, saved, cotangent):
     mu = stage(wall, solve, factors, cotangent)
     d_q, d_qd, d_base = inverse_dynamics_gradient(model, wall, angles, qd, accelerations, base, mu)
     limited = not integrator.endswith(SMOOTH)
-    _, pull = jax.vjp(lambda *motors: actuate(model, *motors, limited)[0], q, qd, ctrl)
+    _, pull = jax.vjp(lambda q, qd, ctrl: actuate(model, q, qd, ctrl, limited)[0], q, qd, ctrl)
     by_torque: Any = pull(list(mu))
     d_motors = (_minus(by_torque[0], d_q), _minus(by_torque[1], d_qd), by_torque[2])
     return d_motors, jax.tree.map(lambda x: -x, d_base), None
