@@ -133,7 +133,30 @@ def first_order() -> str:
             header = [world, *(f"{s} mm" for s in SEAS), *(f"{s} mrad" for s in SEAS), "trained"]
             first = next(iter(cells.values()))
             blocks.append(markdown(header, rows) + "\n\nSource: " + source(first))
+        worst = [_below_paper(cell) for cell in cells.values()]
+        if rows and all(worst):
+            below = [line for lines in worst for line in lines[1:]]
+            found = f"{len(below)} of {6 * len(worst)} below the paper's: " + ", ".join(below)
+            blocks.append(
+                f"Improvements of top 5 %, top 1 % and maximum over `ik`, {world}: {found}"
+            )
     return "\n\n".join(blocks) or "not measured yet (`python experiments/first_order.py`)"
+
+
+def _below_paper(cell: dict[str, str]) -> list[str]:
+    """["checked", cells whose improvement is smaller than the paper's]; [] without such columns."""
+    from mcx_jax.paper import table3
+
+    if "gain_pos_max" not in cell:
+        return []
+    paper, out = table3()[cell["delay"], cell["sea"]], ["checked"]
+    for unit in ("pos", "ang"):
+        for group in ("top5", "top1", "max"):
+            ours, theirs = float(cell[f"gain_{unit}_{group}"]), 100 * paper[f"{unit}_imp_{group}"]
+            if ours < theirs:
+                name = f"{cell['delay']} {cell['sea']} {unit} {group}"
+                out.append(f"{name} {ours:.0f} % (paper {theirs:.0f} %)")
+    return out
 
 
 def speed() -> str:

@@ -8,7 +8,8 @@ that are treated alike; a device owns whole groups. S, the random numbers and so
 depend on the number of devices (but for the order of float32 sums).
 
 A CPU counts as one device per core. XLA would otherwise split every operation over the cores and
-wait for all of them after each (see `stage`): the environment is three times as fast like this.
+wait for all of them after each (see `stage`): 2048 environments on two cores, a control step took
+3.0 us like that, 1.8 us with two devices.
 """
 
 from typing import TypeVar
