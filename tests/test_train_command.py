@@ -3,6 +3,7 @@
 Training runs on a probe environment here; the whole path with the real one is the smoke test.
 """
 
+import functools
 import json
 import os
 import signal
@@ -19,9 +20,10 @@ from mcx_jax import checkpoint, cli, startup
 from mcx_jax.config import EnvConfig, TrainConfig, preset_config
 from mcx_jax.errors import UserError
 from mcx_jax.policy import load_policy
+from mcx_jax.programs import prepare
 from mcx_jax.progress import Progress, short_time
 from mcx_jax.run_dir import default_path, open_existing, open_new
-from mcx_jax.train import StopRequest, compile_quickly, main, read_command, start, train
+from mcx_jax.train import StopRequest, compile_quickly, main, read_command, train
 
 CONFIG = replace(
     preset_config("fast"),
@@ -51,8 +53,13 @@ def _contents(path):
     return {p: p.read_bytes() for p in sorted(path.rglob("*")) if p.is_file()}
 
 
+@functools.cache
+def _like(config):
+    return prepare(config, make_probe(scale=0.01)).like
+
+
 def _state(path, config):
-    return start(open_existing(path, config), make_probe(scale=0.01))
+    return checkpoint.restore_latest(path, _like(config))
 
 
 def _assert_same_run(one, other, config):
@@ -271,9 +278,8 @@ def test_short_time():
     assert [short_time(s) for s in (12.4, 200, 3900)] == ["12 s", "3 min 20 s", "1 h 05 min"]
 
 
-def test_restored_checkpoint_of_another_size_is_refused(finished, tmp_path):
-    config = replace(CONFIG, num_envs=16)
-    like = start(open_new(tmp_path / "other", config), make_probe())
+def test_restored_checkpoint_of_another_size_is_refused(finished):
+    like = _like(replace(CONFIG, num_envs=16))
     with pytest.raises(UserError, match="cannot be restored"):
         checkpoint.restore_latest(finished, like)
 
