@@ -15,9 +15,9 @@ from typing import Any, Literal
 from mcx_jax import machine
 from mcx_jax.errors import UserError
 
-ENVS = (1, 4, 16, 64, 256, 512, 1024, 2048, 4096, 8192, 16384)
+ENVS = (1, 8, 64, 512, 2048, 16384)
 QUICK_ENVS = (1, 64, 2048)
-FEW_ENVS = (1, 64, 2048, 8192)
+FEW_ENVS = (1, 64, 2048)
 """For MJX, whose larger batches take minutes and tell nothing new."""
 ENVIRONMENT_ENVS = (512, 2048, 16384)
 RATIO_ENVS = 2048
