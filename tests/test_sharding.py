@@ -51,11 +51,12 @@ CONFIGS = [
 
 
 @pytest.fixture(scope="module")
-def runs():
+def runs(repo_root):
     """Metrics of the same runs on one and on eight devices."""
     out = {}
     for cores in (1, 8):
-        environment = {**os.environ, "XLA_FLAGS": ""}
+        path = os.pathsep.join([str(repo_root), str(repo_root / "tests")])
+        environment = {**os.environ, "XLA_FLAGS": "", "PYTHONPATH": path}
         command = [sys.executable, "-c", RUN, str(cores)]
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
         out[cores] = json.loads(done.stdout)
