@@ -2,21 +2,19 @@
 
     python experiments/first_order.py [--integrator implicitfast] [DELAY...]
 
-Runs are kept in runs/ and gone on with; writes experiments/first_order.csv (first_order_quiet.csv
-with implicitfast), rows of `ik` and of the runs with their training steps and seconds.
+Runs are kept in runs/ and gone on with if they are not finished; writes experiments/first_order.csv
+(first_order_quiet.csv with implicitfast), rows of `ik` and of the runs.
 """
 
-import json
 import subprocess
 import sys
-import time
-from dataclasses import replace
 from pathlib import Path
 
-from record import evaluation_rows, provenance, write_rows
+from record import run_rows, write_rows
 
 from mcx_jax import startup
-from mcx_jax.run_dir import METRICS, POLICY
+from mcx_jax.checkpoint import latest
+from mcx_jax.run_dir import CONFIG, stored_config
 
 DELAYS = ("E0", "B4_21", "E1", "B4_4", "E2")
 
@@ -26,7 +24,9 @@ def trained(delay: str, quiet: bool) -> Path:
     run = Path("runs") / f"{delay}-first-order-s0{'-quiet' if quiet else ''}"
     command = [sys.executable, "-m", "mcx_jax.train", "--algo", "first-order", "--delay", delay]
     command += ["--run-dir", str(run)] + ["--integrator", "implicitfast"] * quiet
-    if not (run / POLICY).exists():
+    begun = (run / CONFIG).exists()
+    if not begun or latest(run) != stored_config(run).iterations:
+        command += ["--resume"] * begun
         print(" ".join(command), flush=True)
         subprocess.run(command, check=True)
     return run
@@ -35,24 +35,10 @@ def trained(delay: str, quiet: bool) -> Path:
 def main() -> None:
     quiet = "implicitfast" in sys.argv
     delays = [word for word in sys.argv[1:] if word in DELAYS] or DELAYS
-    runs = {delay: trained(delay, quiet) for delay in delays}
+    runs = [trained(delay, quiet) for delay in delays]
     startup.configure()
-    from mcx_jax import cli
-    from mcx_jax.config import TrainConfig
-    from mcx_jax.evaluate import evaluate_beside_ik, load_controller
-
-    out = []
-    for run in runs.values():
-        config = cli.config_from_json(TrainConfig, (run / "config.json").read_text())
-        last = json.loads((run / METRICS).read_text().splitlines()[-1])
-        _, controller = load_controller(str(run))
-        env = replace(config.env, episode_steps=1000)
-        begun = time.monotonic()
-        baseline, rows = evaluate_beside_ik(config.algo, controller, env, config.motion)
-        steps = {"steps": last["steps"], "train_seconds": f"{last['wall_s']:.0f}"}
-        found = evaluation_rows(baseline + rows, time.monotonic() - begun)
-        out += [{**row, **steps, **provenance()} for row in found]
-    write_rows("first_order_quiet" if quiet else "first_order", out)
+    rows = [row for run in runs for row in run_rows(run)]
+    write_rows("first_order_quiet" if quiet else "first_order", rows)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,12 @@
 """What every stored result carries: the command, the commit, the machine and the versions."""
 
 import csv
+import json
 import os
 import subprocess
 import sys
+import time
+from dataclasses import replace
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
@@ -64,3 +67,19 @@ def evaluation_rows(rows: list[dict], seconds: float) -> list[dict]:
             }
         )
     return out
+
+
+def run_rows(run: Path) -> list[dict]:
+    """`ik` and a trained run on the four seas as CSV rows, with its training steps and seconds."""
+    from mcx_jax.evaluate import evaluate_beside_ik, load_controller
+    from mcx_jax.run_dir import METRICS, stored_config
+
+    config = stored_config(run)
+    last = json.loads((run / METRICS).read_text().splitlines()[-1])
+    _, controller = load_controller(str(run))
+    env = replace(config.env, episode_steps=1000)
+    begun = time.monotonic()
+    baseline, rows = evaluate_beside_ik(config.algo, controller, env, config.motion)
+    found = evaluation_rows(baseline + rows, time.monotonic() - begun)
+    steps = {"steps": last["steps"], "train_seconds": f"{last['wall_s']:.0f}"}
+    return [{**row, **steps, **provenance()} for row in found]

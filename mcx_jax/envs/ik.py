@@ -131,8 +131,8 @@ def _pose_error(tool: tuple[Mat, Vec], target: tuple[Mat, Vec]) -> tuple[Scalar,
 
 
 def _normal_matrix(columns: list[tuple], error: Scalar) -> list[list[Scalar]]:
-    """Lower triangle of J J^T, for J given by its columns (one 6-vector a joint), damped where the
-    error norm is large."""
+    """Lower triangle of J J^T + damping 1, for J given by its columns (one 6-vector a joint);
+    damping where the error norm is large."""
     damping = jnp.where(error > REGULARISATION_ABOVE, REGULARISATION, 0.0)
     gram = [
         [total([mul(col[i], col[j]) for col in columns]) for j in range(i + 1)] for i in range(6)

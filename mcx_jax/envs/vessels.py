@@ -80,7 +80,7 @@ def base_state(
 ) -> tuple[Vec, Vec, Vec]:
     """Vessel A's (w, al, a) in its own axes at physics step i, as `chain.BaseState`.
 
-    Three stages: as one, it took as long as the arm's physics.
+    Three stages, so that the interpolation and the sines are computed once.
     """
     x, xd, xdd = stage(wall, seg.at, i)
     turns = stage(wall, lambda rpy: [sincos(angle) for angle in rpy], x[3:])
