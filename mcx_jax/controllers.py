@@ -10,9 +10,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mcx_jax.config import PHYSICS_DT_S, SUBSTEPS
+from mcx_jax.config import CONTROL_DT_S, PHYSICS_DT_S
 from mcx_jax.envs.v2v import ACTION_SCALE, EnvState, V2VEnv
-from mcx_jax.envs.vessels import goal_pose
 from mcx_jax.spatial import (
     Mat,
     Vec,
@@ -59,23 +58,26 @@ class IK:
 
 @struct.dataclass
 class Extrapolate:
-    """The goal's pose T_G^B continued with its last velocity over the known delay plus the hold."""
+    """The goal's pose T_G^B continued with its last velocity over the known delay, half the hold
+    and the age of the measurement."""
 
-    lead_s: float | None = struct.field(pytree_node=False, default=None)
-    """How far ahead, s; None = the delay's group delay plus 10 ms."""
+    lead_s: jax.Array | float | None = None
+    """How far ahead of the measurement's time, s; None = the known delay's group delay plus 10 ms.
+    """
 
     def init(self, env: V2VEnv, state: EnvState) -> tuple[jax.Array, jax.Array]:
         """The present pose."""
-        return state.goal_rotation, state.goal_position
+        return state.measured.rotation, state.measured.position
 
     def act(self, env: V2VEnv, state: EnvState, memory):
         """Move the goal by lead / 20 ms times its last change."""
-        steps = _lead_s(env, self.lead_s) / (SUBSTEPS * PHYSICS_DT_S)
-        r, p = unpack_matrix(state.goal_rotation), unpack(state.goal_position, 3)
+        steps = (_lead_s(env, self.lead_s) + state.conditions.age_s) / CONTROL_DT_S
+        r, p = state.measured.pose
         r_old, p_old = unpack_matrix(memory[0]), unpack(memory[1], 3)
         turn = vscale(steps, log_rotation(matmul(r, transpose(r_old))))
         ahead = matmul(exp_rotation(turn), r), vadd(p, vscale(steps, vsub(p, p_old)))  # type: ignore[arg-type]
-        return (state.goal_rotation, state.goal_position), _correction((r, p), ahead)  # type: ignore[arg-type]
+        memory = state.measured.rotation, state.measured.position
+        return memory, _correction((r, p), ahead)  # type: ignore[arg-type]
 
 
 @struct.dataclass
@@ -93,14 +95,11 @@ class Preview:
     def act(self, env: V2VEnv, state: EnvState, memory: tuple[()]):
         """Aim at the pose that the goal will have."""
         lead = round(_lead_s(env, self.lead_s) / PHYSICS_DT_S)
-        step = state.step * SUBSTEPS + lead
-        ahead = goal_pose(env.motion, state.track, state.goal_m, step)
-        now = unpack_matrix(state.goal_rotation), unpack(state.goal_position, 3)
-        return memory, _correction(now, ahead)  # type: ignore[arg-type]
+        return memory, _correction(state.measured.pose, env.goal_ahead(state, lead))
 
 
-def _lead_s(env: V2VEnv, lead_s: float | None) -> float:
-    return env.delay.group_delay_s + HOLD_LEAD_S if lead_s is None else lead_s
+def _lead_s(env: V2VEnv, lead_s: Any) -> Any:
+    return env.known_delay.group_delay_s + HOLD_LEAD_S if lead_s is None else lead_s
 
 
 def _correction(now: tuple[Mat, Vec], wanted: tuple[Mat, Vec]) -> jax.Array:

@@ -155,7 +155,7 @@ def errors_beside_ik(who: str, controller: Any, env, *, episodes: int, seed: int
     names = ("ik",) if who == "ik" else ("ik", who)
     dp, da, valid = episode_errors(env, controller, (0.0, 1.0)[: len(names)], episodes, seed)
     return [
-        Errors(name, env.delay.name, env.motion.seas, dp[:, k], da[:, k], valid[k])
+        Errors(name, env.config.delay, env.motion.seas, dp[:, k], da[:, k], valid[k])
         for k, name in enumerate(names)
     ]
 
@@ -280,7 +280,7 @@ def main(argv: list[str] | None = None) -> None:
     cli.check_output("--json", config.json)
     for line in startup.configure(config.device, mjx=config.env.physics == "mjx"):
         print(line, file=report)
-    print(config.env.parsed_delay.describe(), file=report)
+    print(config.env.describe_delays(), file=report)
     who, controller = load_controller(config.who)
     baseline, rows = evaluate_beside_ik(
         who, controller, config.env, config.motion, episodes=config.episodes, seed=config.seed

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 
 from mcx_jax.config import CONTROL_DT_S, parse_delay
-from mcx_jax.envs.observe import OBS_SIZE, OBS_TABLE, ObservationRow
+from mcx_jax.envs.observe import AGE, OBS_SIZE, OBS_TABLE, ObservationRow
 from mcx_jax.errors import UserError
 from mcx_jax.ppo.networks import PolicyNet, init_carry, make_cell
 from mcx_jax.ppo.normalise import CLIP, STD_FLOOR
@@ -36,7 +36,8 @@ def describe(net: PolicyNet, obs_size: int, config: str) -> dict[str, Any]:
         obs_size: length of the observation.
         config: JSON of the training run's configuration; what it does not say is left out.
     """
-    observation = OBS_TABLE if obs_size == OBS_SIZE else _unnamed("observation", obs_size)
+    known = {OBS_SIZE: OBS_TABLE, OBS_SIZE + 1: (*OBS_TABLE, AGE)}
+    observation = known.get(obs_size, _unnamed("observation", obs_size))
     action = ACTION_TABLE if net.actions == 6 else _unnamed("action", net.actions)
     return {
         "frames": FRAMES,
@@ -89,6 +90,7 @@ def _trained_for(config: str) -> dict[str, str]:
     """Arm and delay that the policy has learnt to correct; {} if the configuration is no run's."""
     try:
         env = json.loads(config)["env"]
-        return {"arm": env["arm"], "delay": parse_delay(env["delay"]).describe()}
+        delays = [parse_delay(name).describe() for name in env["delay"].split(",")]
+        return {"arm": env["arm"], "delay": "; ".join(delays)}
     except (ValueError, KeyError, TypeError, UserError):
         return {}

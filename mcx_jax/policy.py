@@ -107,7 +107,8 @@ class PolicyController:
     def act(self, env: Any, state: Any, memory: Carry) -> tuple[Carry, jax.Array]:
         """(memory, (A,) action in cm and crad)."""
         del env
-        return act(self.policy, memory, state.obs)
+        # A policy trained without late measurements does not know their age, the last entry.
+        return act(self.policy, memory, state.obs[: self.policy.meta.obs_size])
 
 
 def npz_bytes(policy: Policy) -> bytes:

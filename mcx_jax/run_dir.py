@@ -49,7 +49,7 @@ class RunDir:
 def default_path(config: TrainConfig) -> Path:
     """runs/<delay>-<preset or first-order>-s<seed>, or -s<first>-<last> for several seeds."""
     last = f"-{config.seed + config.seeds - 1}" if config.seeds > 1 else ""
-    delay = config.env.delay.replace(":", "_")
+    delay = config.env.delay.replace(":", "_").replace(",", "+")
     kind = config.preset if config.algo == "ppo" else config.algo
     return Path("runs") / f"{delay}-{kind}-s{config.seed}{last}"
 

@@ -285,7 +285,7 @@ def main(argv: list[str] | None = None) -> None:
     for line in startup.configure(command.device, mjx=run.config.env.physics == "mjx"):
         print(line)
     print(machine.describe())
-    print(run.config.env.parsed_delay.describe())
+    print(run.config.env.describe_delays())
     print(f"run directory: {run.path}", flush=True)
     from mcx_jax.envs.v2v import make_env
 

@@ -17,6 +17,7 @@ import mcx_jax
 from mcx_jax import config
 from mcx_jax.config import (
     NAMED_DELAYS,
+    ConditionsConfig,
     Delay,
     EnvConfig,
     FirstOrderConfig,
@@ -56,7 +57,7 @@ NYQUIST = (
 )
 def test_delay_names_and_literals(text, want):
     assert parse_delay(text) == want
-    assert EnvConfig(delay=text).parsed_delay == want
+    assert EnvConfig(delay=text).delays == (want,)
 
 
 def test_the_papers_cutoffs_as_shares_of_nyquist():
@@ -303,13 +304,23 @@ def _fields_read() -> set[str]:
     return read
 
 
-@pytest.mark.parametrize("cls", [EnvConfig, MotionConfig, PPOConfig, FirstOrderConfig, TrainConfig])
+ALL_CONFIGS = [
+    EnvConfig,
+    ConditionsConfig,
+    MotionConfig,
+    PPOConfig,
+    FirstOrderConfig,
+    TrainConfig,
+]
+
+
+@pytest.mark.parametrize("cls", ALL_CONFIGS)
 def test_every_setting_is_read_somewhere(cls):
     names = set(get_type_hints(cls))
     assert names - _fields_read() == set()
 
 
-@pytest.mark.parametrize("cls", [EnvConfig, MotionConfig, PPOConfig, FirstOrderConfig, TrainConfig])
+@pytest.mark.parametrize("cls", ALL_CONFIGS)
 def test_every_setting_has_a_sentence(cls):
     """The command line's help is the string below each field."""
     tree = dict(_package_trees())["config.py"]
@@ -322,8 +333,8 @@ def test_every_setting_has_a_sentence(cls):
         and isinstance(after, ast.Expr)
         and isinstance(after.value, ast.Constant)
     }
-    nested = {"env", "motion", "ppo", "first_order"} if cls is TrainConfig else set()
-    assert {f.name for f in dataclasses.fields(cls)} - described == nested
+    nested = {TrainConfig: {"env", "motion", "ppo", "first_order"}, EnvConfig: {"conditions"}}
+    assert {f.name for f in dataclasses.fields(cls)} - described == nested.get(cls, set())
 
 
 def test_named_delays_are_the_papers_five():

@@ -356,7 +356,7 @@ def both_worlds(policy, arm, delay, runner, count, steps):
         )
         runner.reset()
         aim = numpy_policy.corrected_goal
-        errors.append(c_loop.episode(machine, config.parsed_delay, window, steer, aim, steps))
+        errors.append(c_loop.episode(machine, config.delays[0], window, steer, aim, steps))
     in_jax = np.stack([dp, da])
     return in_jax[..., :count], in_jax[..., count:], np.stack(errors, axis=-1).swapaxes(0, 1)
 

@@ -81,7 +81,7 @@ def column(tree, i):
 
 
 def goal_of(state):
-    return unpack_matrix(state.goal_rotation), unpack(state.goal_position, 3)
+    return state.measured.pose
 
 
 def assert_states_close(got, want, atol):
@@ -334,8 +334,8 @@ def test_errors_observation_and_reward_agree_with_c(env, episode):
         site = mj.site("tool").id
         tool_r, tool_p = d.site_xmat[site].reshape(3, 3), d.site_xpos[site]
         goal_r, goal_p = np_goal(env, state, SUBSTEPS * i)
-        np.testing.assert_allclose(state.goal_rotation, goal_r, rtol=0, atol=POSE_F32)
-        np.testing.assert_allclose(state.goal_position, goal_p, rtol=0, atol=POSE_F32)
+        np.testing.assert_allclose(state.measured.rotation, goal_r, rtol=0, atol=POSE_F32)
+        np.testing.assert_allclose(state.measured.position, goal_p, rtol=0, atol=POSE_F32)
         dp = np.linalg.norm(goal_p - tool_p)
         da = Rotation.from_matrix(goal_r.T @ tool_r).magnitude()
         # Differences of poses that float32 carries to 1e-6.
@@ -406,9 +406,9 @@ def test_gradient_of_the_reward_by_the_action(env, first):
     # The first step of an episode starts settled: with corrections of 0.1 mm no servo saturates
     # (the weakest: 56 N m / 1e5 N m/rad = 0.56 mrad). No delay, or the reward would not answer.
     with jax.enable_x64(True):
-        env64 = in_float64(env.replace(delay=EnvConfig(delay="E0").parsed_delay))
+        env64 = in_float64(env.replace(config=dataclasses.replace(env.config, delay="E0")))
         state = in_float64(first)
-        state = state.replace(lag=lag.init(env64.delay, state.reference))
+        state = state.replace(lag=lag.init_all(env64.delays, state.reference))
 
         def reward(action):
             return env64.step(state, action).reward
@@ -450,16 +450,17 @@ def test_extrapolation_of_a_steady_motion(env, first):
     np.testing.assert_array_equal(Extrapolate().act(env, first, memory)[1], np.zeros(6))
     # The goal has moved by (1, 2, -1) mm and turned by 2 mrad about B's z within 20 ms: 50 ms
     # ahead it has gone on by 2.5 times that.
-    r, p = np.asarray(first.goal_rotation), np.asarray(first.goal_position)
+    r, p = np.asarray(first.measured.rotation), np.asarray(first.measured.position)
     move, turn = np.array([1e-3, 2e-3, -1e-3]), np.array([0, 0, 2e-3])
-    now = first.replace(
-        goal_rotation=jnp.asarray(np.float32(Rotation.from_rotvec(turn).as_matrix() @ r)),
-        goal_position=jnp.asarray(np.float32(p + move)),
+    measured = first.measured.replace(
+        rotation=jnp.asarray(np.float32(Rotation.from_rotvec(turn).as_matrix() @ r)),
+        position=jnp.asarray(np.float32(p + move)),
     )
+    now = first.replace(measured=measured)
     memory, action = Extrapolate().act(env, now, memory)
     ahead = Rotation.from_rotvec(3.5 * turn).as_matrix() @ r, p + 3.5 * move
     assert_aims_at(now, action, ahead)
-    np.testing.assert_array_equal(memory[1], now.goal_position)
+    np.testing.assert_array_equal(memory[1], now.measured.position)
 
 
 def test_ik_controller_does_nothing(env, first):

@@ -16,7 +16,7 @@ from mcx_jax.ppo.experience import judge
 from mcx_jax.ppo.update import learn
 from mcx_jax.programs import prepare
 from mcx_jax.sharding import env_mesh, put
-from mcx_jax.spatial import unpack, unpack_matrix
+from mcx_jax.spatial import unpack
 from mcx_jax.stage import stage
 
 RESET_ENVS = 256
@@ -57,29 +57,30 @@ def environment_us(env: V2VEnv, state: EnvState, step=V2VEnv.step) -> float:
 def _arm(env: V2VEnv, state: EnvState, _) -> EnvState:
     deck, _ = env._segments(state.track, state.step)
     rate = jnp.zeros_like(state.reference)
-    return replace(state, arm=env._simulate(state.arm, state.reference, rate, deck, SUBSTEPS))
+    arm = env._simulate(state.arm, state.reference, rate, deck, SUBSTEPS, state.conditions)
+    return replace(state, arm=arm)
 
 
 def _ik(env: V2VEnv, state: EnvState, _) -> EnvState:
-    goal = unpack_matrix(state.goal_rotation), unpack(state.goal_position, 3)
-    found = ik.solve(env.model, state.arm.q, goal, ik.WARM_ITERATIONS, env.wall)
+    found = ik.solve(env.model, state.arm.q, state.measured.pose, ik.WARM_ITERATIONS, env.wall)
     return replace(state, arm=ArmState(q=found.q, qd=state.arm.qd))
 
 
 def _vessels(env: V2VEnv, state: EnvState, _) -> EnvState:
     a, b = env._segments(state.track, state.step)
     _, position = stage(env.wall, vessels.goal_in_base, a, b, state.goal_m, SUBSTEPS)
-    return replace(state, goal_position=jnp.stack(position), step=state.step + 1)
+    measured = replace(state.measured, position=jnp.stack(position))
+    return replace(state, measured=measured, step=state.step + 1)
 
 
 def _lag(env: V2VEnv, state: EnvState, _) -> EnvState:
-    late, reference = lag.apply(env.delay, state.lag, state.arm.q)
+    late, reference = lag.apply_one(env.delays, None, state.lag, state.arm.q)
     rate = (reference - state.reference) / CONTROL_DT_S
     return replace(state, lag=late, reference=reference + 0.0 * rate)
 
 
 def _observe(env: V2VEnv, state: EnvState, _) -> EnvState:
-    goal = unpack_matrix(state.goal_rotation), unpack(state.goal_position, 3)
+    goal = state.measured.pose
     tool = ik.tool_pose(env.model, unpack(state.arm.q, env.model.nq), env.wall)
     errors = stage(env.wall, observe.tracking_error, goal, tool)
     return replace(state, obs=observe.observe(goal, tool, errors), reward=-(errors[0] + errors[1]))

@@ -14,6 +14,7 @@ from jax import lax
 from mcx_jax.envs.adjoint import inverse_dynamics_gradient
 from mcx_jax.envs.dynamics import BaseState, bias_forces, factor, joint_sincos, mass_matrix, solve
 from mcx_jax.envs.model import Actuator, ChainModel
+from mcx_jax.envs.plant import Plant, carried_by
 from mcx_jax.spatial import Scalar, add, mul, sub, total
 from mcx_jax.stage import stage
 
@@ -74,30 +75,39 @@ Motors = tuple[tuple, tuple, tuple]
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def joint_accelerations(
-    model: ChainModel, integrator: str, motors: Motors, base: BaseState, wall: jax.Array | None
+    model: ChainModel,
+    integrator: str,
+    motors: Motors,
+    base: BaseState,
+    wall: jax.Array | None,
+    plant: Plant | None,
 ) -> tuple[Scalar, ...]:
     """The acceleration that MuJoCo's integrator multiplies by the time step, rad/s2.
 
     euler: M + h D with the joints' own damping D; implicitfast: the actuators' velocity derivative
-    as well (for a model without damping, euler's is the forward dynamics).
+    as well (for a model without damping, euler's is the forward dynamics); mixed: as the plant
+    says.
 
-    euler-smooth, implicitfast-smooth: the same values with the derivative of an implicitfast step
-    whose servos have no limits. The true derivative is useless here: a jump of 1 mrad in a command
-    already takes a servo of kp 1e5 to its torque limit, where the derivative by the command is 0
-    and that by the state the free arm's, which grows. What brings the arm to its reference within
-    the control step is the switching, which no derivative sees. (Over 20 control steps the true
-    gradient grew by 2 a step, to 1e3 times what central differences of 0.2 mm show.)
+    euler-smooth, implicitfast-smooth, mixed-smooth: the same values with the derivative of an
+    implicitfast step whose servos have no limits. The true derivative is useless here: a jump of 1
+    mrad in a command already takes a servo of kp 1e5 to its torque limit, where the derivative by
+    the command is 0 and that by the state the free arm's, which grows. What brings the arm to its
+    reference within the control step is the switching, which no derivative sees. (Over 20 control
+    steps the true gradient grew by 2 a step, to 1e3 times what central differences of 0.2 mm show.)
 
     The reverse mode is the implicit function theorem's: with (M + h D) qdd + bias = torque and a
     cotangent g of qdd, the cotangents are those of mu . (torque - (M + h D) qdd - bias) for
     mu = (M + h D)^-1 g: one more solve and one reverse sweep of the inverse dynamics, neither the
     mass matrix nor its factors are differentiated (compare Carpentier & Mansard, RSS 2018).
     """
-    return _accelerations(model, integrator, motors, base, wall)[0]
+    return _accelerations(model, integrator, motors, base, wall, plant)[0]
 
 
-def _accelerations(model: ChainModel, integrator: str, motors: Motors, base: BaseState, wall):
+def _accelerations(
+    model: ChainModel, integrator: str, motors: Motors, base: BaseState, wall, plant
+):
     """(value, (accelerations, factors, angles)): the latter are what the gradient needs."""
+    model = carried_by(model, plant)
     q, qd, ctrl = motors
     angles = stage(wall, partial(joint_sincos, model), q)
     bias = stage(wall, partial(bias_forces, model), angles, qd, base)
@@ -108,21 +118,31 @@ def _accelerations(model: ChainModel, integrator: str, motors: Motors, base: Bas
     def factored(damping):
         return stage(wall, factor, _stiffened(matrix, damping, model.timestep_s))
 
-    passive = [link.damping for link in model.links]
-    factors = factored(passive if integrator.removesuffix(SMOOTH) == "euler" else slopes)
+    factors = factored(_damping(model, integrator.removesuffix(SMOOTH), slopes, plant))
     value = tuple(stage(wall, solve, factors, rhs))
     if integrator.endswith(SMOOTH):
         factors = factored(actuate(model, q, qd, ctrl, limited=False)[1])
     return value, (value, factors, angles)
 
 
-def _accelerations_forward(model, integrator, motors, base, wall):
-    value, kept = _accelerations(model, integrator, motors, base, wall)
-    return value, (motors, base, wall, kept)
+def _damping(model: ChainModel, integrator: str, slopes: list[Scalar], plant: Plant | None):
+    """D of M + h D: the part of the damping that an integrator treats implicitly."""
+    passive = [link.damping for link in model.links]
+    if integrator == "mixed":
+        assert plant is not None
+        share = plant.implicit
+        return [add(p, mul(share, sub(s, p))) for p, s in zip(passive, slopes, strict=True)]
+    return {"euler": passive, "implicitfast": slopes}[integrator]
+
+
+def _accelerations_forward(model, integrator, motors, base, wall, plant):
+    value, kept = _accelerations(model, integrator, motors, base, wall, plant)
+    return value, (motors, base, wall, plant, kept)
 
 
 def _accelerations_backward(model, integrator, saved, cotangent):
-    motors, base, wall, (accelerations, factors, angles) = saved
+    motors, base, wall, plant, (accelerations, factors, angles) = saved
+    model = carried_by(model, plant)
     q, qd, ctrl = motors
     mu = stage(wall, solve, factors, cotangent)
     d_q, d_qd, d_base = inverse_dynamics_gradient(model, wall, angles, qd, accelerations, base, mu)
@@ -130,7 +150,7 @@ def _accelerations_backward(model, integrator, saved, cotangent):
     _, pull = jax.vjp(lambda q, qd, ctrl: actuate(model, q, qd, ctrl, limited)[0], q, qd, ctrl)
     by_torque: Any = pull(list(mu))
     d_motors = (_minus(by_torque[0], d_q), _minus(by_torque[1], d_qd), by_torque[2])
-    return d_motors, jax.tree.map(lambda x: -x, d_base), None
+    return d_motors, jax.tree.map(lambda x: -x, d_base), None, None
 
 
 def _minus(a: Sequence[Scalar], b: Sequence[Scalar]) -> tuple[Scalar, ...]:
@@ -156,11 +176,12 @@ def substep(
     ctrl: Sequence[Scalar],
     base: BaseState,
     wall: jax.Array | None = None,
+    plant: Plant | None = None,
 ) -> tuple[list[Scalar], list[Scalar]]:
     """One physics step, semi-implicit as MuJoCo: new velocities, then positions with them."""
     h = model.timestep_s
     motors = (tuple(q), tuple(qd), tuple(ctrl))
-    qdd: Any = joint_accelerations(model, integrator, motors, base, wall)
+    qdd: Any = joint_accelerations(model, integrator, motors, base, wall, plant)
     qd = [v + h * a for v, a in zip(qd, qdd, strict=True)]
     return [x + h * v for x, v in zip(q, qd, strict=True)], qd
 
@@ -174,6 +195,7 @@ def substeps(
     base_at: Callable[[jax.Array], BaseState],
     count: int,
     wall: jax.Array | None = None,
+    plant: Plant | None = None,
 ) -> tuple[jax.Array, jax.Array]:
     """`count` physics steps with the actuator commands held.
 
@@ -183,6 +205,7 @@ def substeps(
         ctrl: (nu,) actuator commands in the model's order.
         base_at: base motion at physics step i of this control step.
         wall: see `stage`.
+        plant: what differs from the model in this episode.
 
     Returns:
         (q, qd) after the steps.
@@ -192,7 +215,7 @@ def substeps(
     def body(i, state):
         angles, rates = state
         base = base_at(i)
-        angles, rates = substep(model, integrator, angles, rates, commands, base, wall)
+        angles, rates = substep(model, integrator, angles, rates, commands, base, wall, plant)
         return tuple(angles), tuple(rates)
 
     n = model.nq

@@ -36,6 +36,25 @@ def sections(delay: Delay) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(row) for row in sos[:, [0, 1, 2, 4, 5]].tolist())
 
 
+def init_all(delays: tuple[Delay, ...], first: jax.Array) -> tuple[LagState, ...]:
+    """`init` of every delay."""
+    return tuple(init(delay, first) for delay in delays)
+
+
+def apply_one(
+    delays: tuple[Delay, ...], which: jax.Array | None, states: tuple[LagState, ...], x: jax.Array
+) -> tuple[tuple[LagState, ...], jax.Array]:
+    """`apply` of delay number `which`, () int32 (None where there is one only).
+
+    All of them run: beside a physics step a filter costs nothing.
+    """
+    found = [apply(delay, state, x) for delay, state in zip(delays, states, strict=True)]
+    late = found[0][1]
+    for number, (_, other) in enumerate(found[1:], 1):
+        late = jnp.where(which == number, other, late)
+    return tuple(state for state, _ in found), late
+
+
 def init(delay: Delay, first: jax.Array) -> LagState:
     """Settled on the first input: a queue full of it, and the filter in steady state.
 

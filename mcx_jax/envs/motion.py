@@ -105,7 +105,7 @@ def _generated(config: MotionConfig, split: Literal["train", "test"]):
     from mcx_jax.sea.spectrum import parse_sea
     from mcx_jax.sea.tables import build_tables
 
-    names = NAMED_SEAS if config.sea == "all" else (config.sea,)
+    names = NAMED_SEAS if config.sea == "all" else tuple(config.sea.split(","))
     seas = [parse_sea(name) for name in names]
     tables = build_tables(seas, split, coupled=config.coupled, split=config.split)
     return tables.sea_names, tables.knots, tables.companion

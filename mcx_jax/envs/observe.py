@@ -31,6 +31,8 @@ OBS_TABLE = (
 """Order of the observation. The paper lists T_G^E for the last pose; the authors' code gives its
 translation in B axes and its rotation as E seen from G, and so do we."""
 OBS_SIZE = sum(row.size for row in OBS_TABLE)
+AGE = ObservationRow("age", 1, "s", "age of the measured pose of G, by its time stamp")
+"""Follows OBS_TABLE where measurements come late (--latency-steps)."""
 
 
 def slices() -> dict[str, slice]:

@@ -13,7 +13,9 @@ from flax import struct
 from mujoco import MjModel
 
 from mcx_jax.config import CONTROL_DT_S, PHYSICS_DT_S, SUBSTEPS, Delay, EnvConfig, MotionConfig
-from mcx_jax.envs import chain, ik, lag, observe, vessels
+from mcx_jax.envs import chain, conditions, ik, lag, observe, vessels
+from mcx_jax.envs.conditions import Conditions, Measurement
+from mcx_jax.envs.goal_path import GoalPath, load_goal_path
 from mcx_jax.envs.model import ChainModel, chain_model, load_mujoco
 from mcx_jax.envs.motion import Motion, Track, draw_track, load_motion
 from mcx_jax.envs.vessels import Segment
@@ -62,20 +64,19 @@ class EnvState:
     """Everything that changes within an episode."""
 
     arm: ArmState
-    lag: lag.LagState
+    lag: tuple[lag.LagState, ...]
     reference: jax.Array
     """(nq,) late joint reference q_hat of the last control step, rad."""
     track: Track
     goal_m: jax.Array
-    """(3,) position of the goal on vessel B."""
-    goal_rotation: jax.Array
-    """(3, 3) R_B_G now."""
-    goal_position: jax.Array
-    """(3,) p_B_G now, m."""
+    """(3,) place of the goal on vessel B; a path is about it."""
+    conditions: Conditions
+    measured: Measurement
+    """T_G^B now, as far as the controller knows."""
     step: jax.Array
     """() int32 control steps done."""
     obs: jax.Array
-    """(38,) see observe.OBS_TABLE."""
+    """(38,) see observe.OBS_TABLE; (39,) with the measurement's age where that is not 0."""
     reward: jax.Array
     """() -(dp + da) at the end of the last step (paper eq. 4)."""
     done: jax.Array
@@ -93,52 +94,86 @@ class V2VEnv:
     wall: jax.Array | None
     """() bool, true: keeps XLA on CPU from recomputing stages (mcx_jax.stage); None on a GPU."""
     model: ChainModel = struct.field(pytree_node=False)
-    delay: Delay = struct.field(pytree_node=False)
+    config: EnvConfig = struct.field(pytree_node=False)
+    known_delay: Delay = struct.field(pytree_node=False)
+    """What a controller without learning believes the delay to be."""
     integrator: str = struct.field(pytree_node=False)
-    """euler or implicitfast, with the chain engine also euler-smooth or implicitfast-smooth."""
-    episode_steps: int = struct.field(pytree_node=False)
+    """euler, implicitfast or mixed; with the chain engine also these with the ending -smooth."""
+    goal_path: GoalPath | None = None
+    """None: the goal stays where it is drawn."""
+
+    @property
+    def delays(self) -> tuple[Delay, ...]:
+        """An episode has one of them."""
+        return self.config.delays
+
+    @property
+    def episode_steps(self) -> int:
+        """Control steps of an episode."""
+        return self.config.episode_steps
 
     @property
     def obs_size(self) -> int:
         """Length of the observation."""
-        return observe.OBS_SIZE
+        return observe.OBS_SIZE + (1 if self.config.conditions.late_sensor else 0)
 
     @property
     def action_size(self) -> int:
         """Length of the action: 3 translation (cm), 3 rotation (crad)."""
         return 6
 
-    def reset(self, key: jax.Array, sea: jax.Array | int | None = None) -> EnvState:
-        """A new episode: random windows and goal, arm settled on the goal, vessels still.
+    def draw(
+        self, key: jax.Array, sea: jax.Array | int | None = None
+    ) -> tuple[Track, jax.Array, Conditions]:
+        """What is random in an episode: windows of motion, place of the goal, (3,) m, conditions.
 
         Args:
             sea: index into motion.seas; None draws one.
         """
         uniform = jax.random.uniform(key, (7,))
         track = draw_track(self.motion, uniform[:4], sea)
-        goal_m = vessels.draw_goal(uniform[4:])
+        path_steps = self.goal_path.period_steps if self.goal_path else 0
+        drawn = conditions.draw(self.config, key, path_steps)
+        return track, vessels.draw_goal(uniform[4:]), drawn
+
+    def reset(
+        self,
+        key: jax.Array,
+        sea: jax.Array | int | None = None,
+        given: Conditions | None = None,
+    ) -> EnvState:
+        """A new episode: random windows and goal, arm settled on the goal, vessels still.
+
+        Args:
+            sea: index into motion.seas; None draws one.
+            given: in place of the conditions that `draw` finds.
+        """
+        track, goal_m, drawn = self.draw(key, sea)
+        drawn = drawn if given is None else given
         with jax.named_scope("vessels"):
             seg_a, seg_b = self._segments(track, jnp.int32(0))
-            goal = stage(self.wall, vessels.goal_in_base, seg_a, seg_b, goal_m, 0)
+            place = self.goal_on_deck(goal_m, drawn, jnp.int32(0))
+            goal = stage(self.wall, vessels.goal_in_base, seg_a, seg_b, place, 0)
+            measured = conditions.first_measurement(drawn, self.config, goal)
         with jax.named_scope("ik"):
             start = jnp.asarray(_start_pose(self.model), goal_m.dtype)
             found = ik.solve(self.model, start, goal, ik.COLD_ITERATIONS, self.wall)
         with jax.named_scope("settle"):
             arm = ArmState(q=found.q, qd=jnp.zeros_like(found.q))
             still = vessels.still(seg_a)
-            arm = self._simulate(arm, found.q, jnp.zeros_like(found.q), still, SETTLE_STEPS)
-        tool = ik.tool_pose(self.model, unpack(arm.q, self.model.nq), self.wall)
-        errors = stage(self.wall, observe.tracking_error, goal, tool)
+            rest = jnp.zeros_like(found.q)
+            arm = self._simulate(arm, found.q, rest, still, SETTLE_STEPS, drawn)
+        errors, obs = self._observe(arm, goal, measured, drawn)
         return EnvState(
             arm=arm,
-            lag=lag.init(self.delay, found.q),
+            lag=lag.init_all(self.delays, found.q),
             reference=found.q,
             track=track,
             goal_m=goal_m,
-            goal_rotation=_stack_matrix(goal[0]),
-            goal_position=jnp.stack(goal[1]),
+            conditions=drawn,
+            measured=measured,
             step=jnp.int32(0),
-            obs=observe.observe(goal, tool, errors),
+            obs=obs,
             reward=-(errors[0] + errors[1]),
             done=jnp.asarray(False),
             metrics=Metrics(*errors, ik_error=found.error, valid=_valid(found, arm, errors[0])),
@@ -148,40 +183,74 @@ class V2VEnv:
         """One control step of 20 ms.
 
         Args:
-            action: (6,) correction of the goal in its own axes: 3 cm, 3 crad (rotation vector).
+            action: (6,) correction of the goal in its own axes: 3 cm, 3 crad (rotation vector);
+                bounded by --max-correction.
         """
-        goal = _goal(state)
+        drawn = state.conditions
         with jax.named_scope("correct"):
-            target = stage(self.wall, correct, goal, action)
+            bound = self.config.max_correction
+            action = jnp.clip(action, -bound, bound)
+            target = stage(self.wall, correct, state.measured.pose, action)
         with jax.named_scope("ik"):
             found = ik.solve(self.model, state.arm.q, target, ik.WARM_ITERATIONS, self.wall)
         with jax.named_scope("lag"):
-            lag_state, reference = lag.apply(self.delay, state.lag, found.q)
+            lag_state, reference = lag.apply_one(self.delays, drawn.delay, state.lag, found.q)
             rate = (reference - state.reference) / CONTROL_DT_S
             rate = jnp.where(state.step == 0, 0.0, rate)
         with jax.named_scope("vessels"):
             seg_a, seg_b = self._segments(state.track, state.step)
-            goal = stage(self.wall, vessels.goal_in_base, seg_a, seg_b, state.goal_m, SUBSTEPS)
+            place = self.goal_on_deck(state.goal_m, drawn, (state.step + 1) * SUBSTEPS)
+            goal = stage(self.wall, vessels.goal_in_base, seg_a, seg_b, place, SUBSTEPS)
         with jax.named_scope("arm"):
-            arm = self._simulate(state.arm, reference, rate, seg_a, SUBSTEPS)
+            arm = self._simulate(state.arm, reference, rate, seg_a, SUBSTEPS, drawn)
         with jax.named_scope("observe"):
-            tool = ik.tool_pose(self.model, unpack(arm.q, self.model.nq), self.wall)
-            errors = stage(self.wall, observe.tracking_error, goal, tool)
-            obs = observe.observe(goal, tool, errors)
+            measured = conditions.measure(drawn, state.measured.queue, goal, state.step + 1)
+            errors, obs = self._observe(arm, goal, measured, drawn)
         valid = state.metrics.valid & _valid(found, arm, errors[0])
         return replace(
             state,
             arm=arm,
             lag=lag_state,
             reference=reference,
-            goal_rotation=_stack_matrix(goal[0]),
-            goal_position=jnp.stack(goal[1]),
+            measured=measured,
             step=state.step + 1,
             obs=obs,
             reward=-(errors[0] + errors[1]),
             done=state.step + 1 >= self.episode_steps,
             metrics=Metrics(*errors, ik_error=found.error, valid=valid),
         )
+
+    def goal_on_deck(self, goal_m: jax.Array, drawn: Conditions, step: jax.Array) -> jax.Array:
+        """(3,) place of the goal on vessel B, m, at a physics step of the episode."""
+        if self.goal_path is None or drawn.path_start is None:
+            return goal_m
+        return goal_m + self.goal_path.at(drawn.path_start + step)
+
+    def goal_at(
+        self, track: Track, goal_m: jax.Array, drawn: Conditions, step: jax.Array
+    ) -> tuple[Mat, Vec]:
+        """The TRUE pose T_G^B at a physics step of an episode."""
+        place = self.goal_on_deck(goal_m, drawn, step)
+        return vessels.goal_pose(self.motion, track, place, step)
+
+    def goal_ahead(self, state: EnvState, steps: jax.Array | int) -> tuple[Mat, Vec]:
+        """The TRUE pose T_G^B a number of physics steps after now."""
+        step = state.step * SUBSTEPS + steps
+        return self.goal_at(state.track, state.goal_m, state.conditions, step)
+
+    def _observe(
+        self, arm: ArmState, goal: tuple[Mat, Vec], measured: Measurement, drawn: Conditions
+    ):
+        """True errors (dp m, da rad), and the observation, made of what is measured."""
+        tool = ik.tool_pose(self.model, unpack(arm.q, self.model.nq), self.wall)
+        errors = stage(self.wall, observe.tracking_error, goal, tool)
+        if not self.config.conditions.imperfect_sensor:
+            return errors, observe.observe(goal, tool, errors)
+        seen = stage(self.wall, observe.tracking_error, measured.pose, tool)
+        obs = observe.observe(measured.pose, tool, seen)
+        if drawn.latency is not None:
+            obs = jnp.append(obs, drawn.age_s)
+        return errors, obs
 
     def _segments(self, track: Track, step: jax.Array) -> tuple[Segment, Segment]:
         """Motion of both vessels during the control step that begins at `step` (20 ms units)."""
@@ -192,15 +261,22 @@ class V2VEnv:
         )
 
     def _simulate(
-        self, arm: ArmState, reference: jax.Array, rate: jax.Array, seg_a: Segment, count: int
+        self,
+        arm: ArmState,
+        reference: jax.Array,
+        rate: jax.Array,
+        seg_a: Segment,
+        count: int,
+        drawn: Conditions,
     ) -> ArmState:
         """The engine behind one function: physics steps of 2 ms with the references held."""
         ctrl = command(self.model, reference, rate)
         # The engines advance a base at physics step i by the deck's motion at that instant.
         base_at = lambda i: vessels.base_state(seg_a, i, self.wall)  # noqa: E731
         if self.mjx_model is None:
+            system = self.model, self.integrator
             q, qd = chain.substeps(
-                self.model, self.integrator, arm.q, arm.qd, ctrl, base_at, count, self.wall
+                *system, arm.q, arm.qd, ctrl, base_at, count, self.wall, drawn.plant
             )
         else:
             from mcx_jax.envs import mjx_engine
@@ -220,16 +296,6 @@ def correct(goal: tuple[Mat, Vec], action: jax.Array) -> tuple[Mat, Vec]:
 def command(model: ChainModel, reference: jax.Array, rate: jax.Array) -> jax.Array:
     """(nu,) actuator commands: position servos get the reference, velocity servos its rate."""
     return jnp.stack([(reference if act.bias[1] else rate)[act.joint] for act in model.actuators])
-
-
-def _goal(state: EnvState) -> tuple[Mat, Vec]:
-    r, p = state.goal_rotation, state.goal_position
-    rows = tuple(tuple(r[i, j] for j in range(3)) for i in range(3))
-    return rows, (p[0], p[1], p[2])  # type: ignore[return-value]
-
-
-def _stack_matrix(m: Mat) -> jax.Array:
-    return jnp.stack([jnp.stack(row) for row in m])
 
 
 def _valid(found: ik.IKResult, arm: ArmState, pos_error_m: jax.Array) -> jax.Array:
@@ -269,9 +335,10 @@ def make_env(
         mjx_model=mjx_model,
         wall=jnp.asarray(True) if jax.default_backend() == "cpu" else None,
         model=model,
-        delay=config.parsed_delay,
+        config=config,
+        known_delay=config.delays[0],
         integrator=integrator,
-        episode_steps=config.episode_steps,
+        goal_path=load_goal_path(config.goal),
     )
 
 

@@ -115,7 +115,11 @@ def goal_in_base(
 
 
 def goal_pose(motion: Motion, track: Track, goal_m: jax.Array, step: jax.Array) -> tuple[Mat, Vec]:
-    """T_G^B at a physics step counted from the episode's beginning."""
+    """T_G^B at a physics step counted from the episode's beginning.
+
+    Args:
+        goal_m: (3,) position of the goal on vessel B at that step, m.
+    """
     seg_a = segment(motion.knots_a, track.table, track.start_a + step)
     seg_b = segment(motion.knots_b, track.table, track.start_b + step)
     return goal_in_base(seg_a, seg_b, goal_m, 0)

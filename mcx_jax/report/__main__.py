@@ -92,7 +92,7 @@ def main(argv: list[str] | None = None) -> None:
     own = dataclasses.replace(EnvConfig(), **entries.common_settings(loaded, argv))
     # Again, with the runs' own task as the defaults.
     config = cli.parse(ReportConfig, argv, prog="report", default=ReportConfig(env=own))
-    print(config.env.parsed_delay.describe())
+    print(config.env.describe_delays())
 
     from mcx_jax.report.build import build
 

@@ -54,7 +54,7 @@ def build(
     names = ", ".join(entry.label for entry in entries)
     html = page(
         f"Motion compensation, delay {config.env.delay}",
-        f"{names}: {config.episodes} test episodes a sea. {config.env.parsed_delay.describe()}.",
+        f"{names}: {config.episodes} test episodes a sea. {config.env.describe_delays()}.",
         sections.lead(rows, [e.label for e in entries if e.learned]),
         chapters,
         pngs,

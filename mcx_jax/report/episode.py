@@ -89,7 +89,7 @@ def _sample(env: V2VEnv, before: EnvState, after: EnvState, action: jax.Array) -
     ctrl = command(model, after.reference, rate)
     rates, commands = unpack(after.arm.qd, model.nq), unpack(ctrl, len(model.actuators))
     return Episode(
-        goal_m=after.goal_position,
+        goal_m=jnp.stack(env.goal_ahead(after, 0)[1]),
         reference_m=jnp.stack(ik.tool_pose(model, unpack(after.reference, model.nq))[1]),
         tool_m=jnp.stack(ik.tool_pose(model, angles)[1]),
         pos_error_m=after.metrics.pos_error_m,

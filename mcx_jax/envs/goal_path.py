@@ -1,0 +1,87 @@
+"""Paths that the goal follows on vessel B's deck (the paper's future work), about its drawn place.
+
+A path is a table of offsets, one a physics step of 2 ms, read with an integer index.
+"""
+
+import math
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from mcx_jax.config import PHYSICS_DT_S
+from mcx_jax.errors import UserError
+
+PERIOD_S = 6.0
+RADIUS_M = 0.05
+"""52 mm/s along the circle: a quarter of the goal's own speed in Wa."""
+CLOSED_M = 1e-3
+"""A recorded path that ends this near its beginning is gone round again; others stop there."""
+MAX_FILE_S = 3600.0
+
+
+@struct.dataclass
+class GoalPath:
+    """Offsets of the goal from its drawn place."""
+
+    offsets_m: jax.Array
+    """(P, 3) in vessel B's axes."""
+    closed: bool = struct.field(pytree_node=False)
+    """Gone round again after P steps; an open one ends at its last offset."""
+
+    @property
+    def period_steps(self) -> int:
+        """Physics steps of a closed path, 0 of an open one."""
+        return self.offsets_m.shape[0] if self.closed else 0
+
+    def at(self, step: jax.Array) -> jax.Array:
+        """(3,) offset at a physics step, m."""
+        count = self.offsets_m.shape[0]
+        index = step % count if self.closed else jnp.minimum(step, count - 1)
+        return self.offsets_m[index]
+
+
+def load_goal_path(name: str) -> GoalPath | None:
+    """The path of `--goal`: static (None), circle, lissajous, or a .csv file with t,x,y,z (s, m).
+
+    Raises:
+        UserError: no such name or file, or a file that is not a path.
+    """
+    if name == "static":
+        return None
+    if name in ("circle", "lissajous"):
+        phase = 2 * math.pi * np.arange(round(PERIOD_S / PHYSICS_DT_S)) * PHYSICS_DT_S / PERIOD_S
+        offsets = RADIUS_M * np.stack(
+            [np.cos(phase), np.sin(phase), np.zeros_like(phase)]
+            if name == "circle"
+            else [np.sin(phase), np.sin(2 * phase), np.zeros_like(phase)],
+            axis=1,
+        )
+        return GoalPath(jnp.asarray(offsets, jnp.float32), closed=True)
+    return _from_file(name)
+
+
+def _from_file(name: str) -> GoalPath:
+    path = Path(name)
+    if not path.is_file():
+        raise UserError(
+            f"--goal {name}: not static, circle or lissajous, and no such file; give a .csv file "
+            "with columns t,x,y,z (s, m)"
+        )
+    try:
+        rows = np.genfromtxt(path, delimiter=",", comments="#", dtype=np.float64, ndmin=2)
+        rows = rows[1:] if np.isnan(rows[0]).all() else rows  # a header
+    except (ValueError, IndexError, UnicodeDecodeError):
+        raise UserError(f"--goal {name}: not a table of numbers t,x,y,z") from None
+    if rows.shape[1:] != (4,) or len(rows) < 2 or not np.isfinite(rows).all():
+        raise UserError(f"--goal {name}: needs at least two rows of four finite numbers t,x,y,z")
+    time_s = rows[:, 0] - rows[0, 0]
+    if np.any(np.diff(time_s) <= 0) or time_s[-1] > MAX_FILE_S:
+        raise UserError(f"--goal {name}: t must increase, and by at most {MAX_FILE_S:g} s")
+    closed = bool(np.linalg.norm(rows[-1, 1:] - rows[0, 1:]) < CLOSED_M)
+    steps = max(round(time_s[-1] / PHYSICS_DT_S), 1)
+    at = PHYSICS_DT_S * np.arange(steps if closed else steps + 1)
+    offsets = np.stack([np.interp(at, time_s, rows[:, i]) for i in (1, 2, 3)], axis=1)
+    return GoalPath(jnp.asarray(offsets, jnp.float32), closed)
