@@ -77,7 +77,7 @@ class Extrapolate:
         turn = vscale(steps, log_rotation(matmul(r, transpose(r_old))))
         ahead = matmul(exp_rotation(turn), r), vadd(p, vscale(steps, vsub(p, p_old)))  # type: ignore[arg-type]
         memory = state.measured.rotation, state.measured.position
-        return memory, _correction((r, p), ahead)  # type: ignore[arg-type]
+        return memory, correction((r, p), ahead)  # type: ignore[arg-type]
 
 
 @struct.dataclass
@@ -95,14 +95,14 @@ class Preview:
     def act(self, env: V2VEnv, state: EnvState, memory: tuple[()]):
         """Aim at the pose that the goal will have."""
         lead = round(_lead_s(env, self.lead_s) / PHYSICS_DT_S)
-        return memory, _correction(state.measured.pose, env.goal_ahead(state, lead))
+        return memory, correction(state.measured.pose, env.goal_ahead(state, lead))
 
 
 def _lead_s(env: V2VEnv, lead_s: Any) -> Any:
     return env.known_delay.group_delay_s + HOLD_LEAD_S if lead_s is None else lead_s
 
 
-def _correction(now: tuple[Mat, Vec], wanted: tuple[Mat, Vec]) -> jax.Array:
+def correction(now: tuple[Mat, Vec], wanted: tuple[Mat, Vec]) -> jax.Array:
     """(6,) action that turns goal pose `now` into `wanted`, cm and crad in the goal's axes."""
     shift = tmatvec(now[0], vsub(wanted[1], now[1]))
     turn = log_rotation(matmul(transpose(now[0]), wanted[0]))
@@ -110,4 +110,4 @@ def _correction(now: tuple[Mat, Vec], wanted: tuple[Mat, Vec]) -> jax.Array:
 
 
 CLASSICAL = {"ik": IK(), "extrapolate": Extrapolate(), "preview": Preview()}
-"""Controllers by the name that the command line uses."""
+"""Controllers by the name that the command line uses; `mcx_jax.fitted` has two more."""

@@ -1,7 +1,7 @@
 """`python -m mcx_jax.evaluate WHO --delay D`: errors of a controller over fixed test episodes.
 
-WHO is ik, extrapolate, preview, a run directory or a policy file. The same seed gives the same
-motion and the same goals to everyone.
+WHO is ik, extrapolate, extrapolate-best, fir, preview, a run directory or a policy file. The same
+seed gives the same motion and the same goals to everyone.
 """
 
 import functools
@@ -13,10 +13,11 @@ from typing import Annotated, Any
 
 import tyro
 
-from mcx_jax.config import EnvConfig, MotionConfig
+from mcx_jax.config import EnvConfig, MotionConfig, parse_delay
 from mcx_jax.errors import UserError
 
-WHO = ("ik", "extrapolate", "preview")
+WHO = ("ik", "extrapolate", "extrapolate-best", "fir", "preview")
+FITTED = ("extrapolate-best", "fir")
 
 
 @dataclass(frozen=True)
@@ -24,11 +25,13 @@ class EvaluateConfig:
     """Evaluate a controller on test motion that no training has seen."""
 
     who: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="WHO")]
-    """ik, extrapolate, preview, a run directory, or a policy .npz file."""
+    """ik, extrapolate, extrapolate-best, fir, preview, a run directory, or a policy .npz file."""
     episodes: int = 50
     """Test episodes per sea state (paper: 50)."""
     seed: int = 0
     """Seed of the episodes' windows and goals; the same for everyone evaluated."""
+    known_delay: str = ""
+    """Delay that controllers without learning are told; default the true one (the first)."""
     json: str = ""
     """Write the result as JSON to this file ('-' or no value: standard output)."""
     device: str = "auto"
@@ -41,6 +44,8 @@ class EvaluateConfig:
             raise UserError(f"--episodes {self.episodes}: must be a positive integer")
         if self.seed < 0:
             raise UserError(f"--seed {self.seed}: must be 0 or a positive integer")
+        if self.known_delay:
+            parse_delay(self.known_delay)
 
 
 def run_episodes(env, controller, keys, seas, gain):
@@ -148,6 +153,23 @@ def evaluation_env(env_config: EnvConfig, motion_config: MotionConfig):
             f"counted; evaluate at least {WARM_UP_STEPS + 1}"
         )
     return make_env(env_config, motion_config, split="test")
+
+
+def fit_if_needed(
+    who: str, controller: Any, env_config: EnvConfig, motion_config: MotionConfig, known_delay: str
+) -> Any:
+    """The controller of `load_controller`, fitted on training motion if it is one of FITTED."""
+    if controller is not None:
+        return controller
+    from mcx_jax.envs.v2v import make_env
+    from mcx_jax.fitted import fitted
+
+    return fitted(who, informed(make_env(env_config, motion_config, split="train"), known_delay))
+
+
+def informed(env, known_delay: str):
+    """The task with controllers without learning told another delay ("": the true one)."""
+    return env.replace(known_delay=parse_delay(known_delay)) if known_delay else env
 
 
 def errors_beside_ik(who: str, controller: Any, env, *, episodes: int, seed: int) -> list[Errors]:
@@ -258,8 +280,11 @@ def policy_path(who: str) -> Path | None:
 
 
 def load_controller(who: str) -> tuple[str, Any]:
-    """(name, controller) for a name, a run directory or a policy file."""
+    """(name, controller) for a name, a run directory or a policy file; the controller is None for
+    one of FITTED, which needs a task first (`fit_if_needed`)."""
     path = policy_path(who)
+    if who in FITTED:
+        return who, None
     if path is None:
         from mcx_jax.controllers import CLASSICAL
 
@@ -282,9 +307,10 @@ def main(argv: list[str] | None = None) -> None:
         print(line, file=report)
     print(config.env.describe_delays(), file=report)
     who, controller = load_controller(config.who)
-    baseline, rows = evaluate_beside_ik(
-        who, controller, config.env, config.motion, episodes=config.episodes, seed=config.seed
-    )
+    env = informed(evaluation_env(config.env, config.motion), config.known_delay)
+    controller = fit_if_needed(who, controller, config.env, config.motion, config.known_delay)
+    errors = errors_beside_ik(who, controller, env, episodes=config.episodes, seed=config.seed)
+    baseline, rows = rows_beside_ik(errors)
     print_table(rows if who == "ik" else baseline + rows, file=report)
     if quiet:
         print(json.dumps(rows, indent=1))

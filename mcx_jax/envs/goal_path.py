@@ -70,12 +70,8 @@ def _from_file(name: str) -> GoalPath:
             f"--goal {name}: not static, circle or lissajous, and no such file; give a .csv file "
             "with columns t,x,y,z (s, m)"
         )
-    try:
-        rows = np.genfromtxt(path, delimiter=",", comments="#", dtype=np.float64, ndmin=2)
-        rows = rows[1:] if np.isnan(rows[0]).all() else rows  # a header
-    except (ValueError, IndexError, UnicodeDecodeError):
-        raise UserError(f"--goal {name}: not a table of numbers t,x,y,z") from None
-    if rows.shape[1:] != (4,) or len(rows) < 2 or not np.isfinite(rows).all():
+    rows = _read(name, path)
+    if len(rows) < 2 or not np.isfinite(rows).all():
         raise UserError(f"--goal {name}: needs at least two rows of four finite numbers t,x,y,z")
     time_s = rows[:, 0] - rows[0, 0]
     if np.any(np.diff(time_s) <= 0) or time_s[-1] > MAX_FILE_S:
@@ -85,3 +81,23 @@ def _from_file(name: str) -> GoalPath:
     at = PHYSICS_DT_S * np.arange(steps if closed else steps + 1)
     offsets = np.stack([np.interp(at, time_s, rows[:, i]) for i in (1, 2, 3)], axis=1)
     return GoalPath(jnp.asarray(offsets, jnp.float32), closed)
+
+
+def _read(name: str, path: Path) -> np.ndarray:
+    """(rows, 4) numbers; a header and lines that begin with # are left out."""
+    try:
+        lines = [line.split(",") for line in path.read_text("utf-8").splitlines() if line.strip()]
+        lines = [words for words in lines if not words[0].lstrip().startswith("#")]
+        if lines and not _is_number(lines[0][0]):
+            lines = lines[1:]
+        return np.array([[float(word) for word in words] for words in lines]).reshape(-1, 4)
+    except (ValueError, OSError):
+        raise UserError(f"--goal {name}: not a table of four numbers a row, t,x,y,z") from None
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

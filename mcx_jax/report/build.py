@@ -3,7 +3,7 @@
 import json
 import shlex
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from typing import Any
 
@@ -11,7 +11,13 @@ import numpy as np
 
 from mcx_jax import machine
 from mcx_jax.config import CONTROL_DT_S
-from mcx_jax.evaluate import Errors, errors_beside_ik, evaluation_env, rows_beside_ik
+from mcx_jax.evaluate import (
+    Errors,
+    errors_beside_ik,
+    evaluation_env,
+    fit_if_needed,
+    rows_beside_ik,
+)
 from mcx_jax.report import sections, style
 from mcx_jax.report.entries import Entry, learning_curves
 from mcx_jax.report.episode import record, torque_limits_nm
@@ -34,6 +40,10 @@ def build(
         say: prints a line of progress.
     """
     env = evaluation_env(config.env, config.motion)
+    entries = [
+        replace(e, controller=fit_if_needed(e.who, e.controller, config.env, config.motion, ""))
+        for e in entries
+    ]
     errors, rows = _evaluate(config, env, entries, say)
     colours = style.colours([entry.label for entry in entries])
     shown = [e for e in entries if e.learned] or list(entries[1:])[-1:]

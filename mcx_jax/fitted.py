@@ -1,0 +1,133 @@
+"""Controllers whose numbers are found on training motion: the strongest rivals without a policy.
+
+`extrapolate-best` is `extrapolate` with the lead that tracks best; `fir` predicts the goal by a
+linear filter of its last poses (finite impulse response), fitted by least squares. Both see what a
+policy sees of the goal, are told the delay and the age of measurements, and are fitted under the
+conditions they are evaluated under: they know more than a policy that was trained for many.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from mcx_jax.config import CONTROL_DT_S, PHYSICS_DT_S, SUBSTEPS
+from mcx_jax.controllers import HOLD_LEAD_S, Extrapolate, correction
+from mcx_jax.envs import conditions
+from mcx_jax.envs.v2v import EnvState, V2VEnv
+from mcx_jax.spatial import (
+    exp_rotation,
+    log_rotation,
+    matmul,
+    transpose,
+    unpack,
+    unpack_matrix,
+    vadd,
+)
+
+TAPS = 25
+"""Poses that the filter sees, half a second of them; twice as many gained nothing measurable."""
+LEADS_S = tuple(HOLD_LEAD_S + x for x in (-0.010, 0.0, 0.004, 0.008, 0.012, 0.020))
+"""Leads tried beyond the known delay: the servo's own lag is in none of the names."""
+FIT_EPISODES, FIT_STEPS = 48, 500
+FIT_SEED = 1_000_003
+RIDGE = 1e-9
+"""Times the number of rows, m2: far below the motion, so that 144 unknowns stay determined."""
+
+
+@struct.dataclass
+class Fir:
+    """The goal's pose ahead as a linear function of how it got where it is."""
+
+    weights: jax.Array
+    """(6 (TAPS - 1), 6): from the changes of pose (m, rad, in B) to the change still to come."""
+
+    def init(self, env: V2VEnv, state: EnvState) -> jax.Array:
+        """(TAPS, 12) poses: the present one, as if the goal had always been there."""
+        return jnp.broadcast_to(_flat(state.measured), (TAPS, 12))
+
+    def act(self, env: V2VEnv, state: EnvState, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Move the goal to where it is predicted."""
+        memory = jnp.concatenate([memory[1:], _flat(state.measured)[None]])
+        change = unpack(features(memory) @ self.weights, 6)
+        r, p = state.measured.pose
+        ahead = matmul(exp_rotation(change[3:]), r), vadd(p, change[:3])  # type: ignore[arg-type]
+        return memory, correction((r, p), ahead)
+
+
+def _flat(measured: conditions.Measurement) -> jax.Array:
+    return jnp.concatenate([measured.rotation.ravel(), measured.position])
+
+
+def features(poses: jax.Array) -> jax.Array:
+    """(6 (TAPS - 1),) changes from the last TAPS - 1 poses to the present one, m and rad in B."""
+    r, p = poses[:, :9].reshape(-1, 3, 3), poses[:, 9:]
+    now = unpack_matrix(r[-1])
+    turns = jax.vmap(
+        lambda old: jnp.stack(log_rotation(matmul(now, transpose(unpack_matrix(old)))))
+    )
+    return jnp.concatenate([(p[-1] - p[:-1]).ravel(), turns(r[:-1]).ravel()])
+
+
+def fit_fir(env: V2VEnv, lead_s: float) -> Fir:
+    """Least squares over training motion.
+
+    Args:
+        env: on training motion; its conditions are those of the fit.
+        lead_s: how far ahead of the present, not of a late measurement, to predict.
+    """
+    keys = jax.random.split(jax.random.key(FIT_SEED), FIT_EPISODES)
+    x, y = jax.device_get(_regression(env, keys, jnp.int32(round(lead_s / PHYSICS_DT_S))))
+    x, y = (a.reshape(-1, a.shape[-1]).astype(np.float64) for a in (x, y))
+    normal = x.T @ x + RIDGE * len(x) * np.eye(x.shape[1])
+    return Fir(jnp.asarray(np.linalg.solve(normal, x.T @ y), jnp.float32))
+
+
+@jax.jit
+def _regression(env: V2VEnv, keys: jax.Array, lead: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """(episodes, steps, features), (episodes, steps, 6): what the filter sees and what it wants."""
+
+    def episode(key):
+        track, goal_m, drawn = env.draw(key)
+        goal = lambda step: env.goal_at(track, goal_m, drawn, step)  # noqa: E731
+        first = conditions.first_measurement(drawn, env.config, goal(jnp.int32(0)))
+
+        def body(measured, step):
+            measured = conditions.measure(drawn, measured.queue, goal(step * SUBSTEPS), step)
+            r, p = goal(step * SUBSTEPS + lead)
+            turn = log_rotation(matmul(r, transpose(unpack_matrix(measured.rotation))))
+            shift = jnp.stack(p) - measured.position
+            return measured, (_flat(measured), jnp.concatenate([shift, jnp.stack(turn)]))
+
+        _, (poses, wanted) = jax.lax.scan(body, first, jnp.arange(1, FIT_STEPS + 1))
+        rows = jnp.arange(FIT_STEPS - TAPS + 1)[:, None] + jnp.arange(TAPS)
+        return jax.vmap(features)(poses[rows]), wanted[TAPS - 1 :]
+
+    return jax.lax.map(episode, keys)
+
+
+def fitted(who: str, env: V2VEnv) -> Any:
+    """The controller `extrapolate-best` or `fir`, with the lead that tracks best.
+
+    Args:
+        env: on training motion.
+    """
+    known_s = env.known_delay.group_delay_s
+    leads_s = [known_s + lead for lead in LEADS_S]
+    if who == "extrapolate-best":
+        candidates: list[Any] = [Extrapolate(jnp.float32(lead)) for lead in leads_s]
+    else:
+        candidates = [fit_fir(env, lead) for lead in leads_s]
+    scores = [_score(env, candidate) for candidate in candidates]
+    return candidates[int(np.argmin(scores))]
+
+
+def _score(env: V2VEnv, controller: Any) -> float:
+    """Mean of dp and da (m + rad) over training episodes, the reward's own measure."""
+    from mcx_jax.evaluate import episode_errors
+
+    dp, da, _ = episode_errors(env, controller, (1.0,), 8, FIT_SEED)
+    warm = round(1.0 / CONTROL_DT_S)
+    return float(np.mean(dp[warm:]) + np.mean(da[warm:]))
