@@ -20,8 +20,8 @@ Episode n of seed s begins with the key `fold_in(key(s), n)`, alone and among ma
 """
 
 import dataclasses
-import functools
 from collections.abc import Sequence
+from functools import cache, partial
 from typing import Any, Literal
 
 import gymnasium
@@ -35,6 +35,7 @@ from gymnasium.vector.utils import batch_space
 from mcx_jax.config import CONTROL_DT_S, EnvConfig, MotionConfig
 from mcx_jax.envs.v2v import EnvState, V2VEnv, make_env
 from mcx_jax.errors import UserError
+from mcx_jax.playground import finite_step
 
 ACTION_LIMIT = 10.0
 """Bound of the action space, cm and crad: three times the largest error without a correction. The
@@ -65,12 +66,7 @@ def _reset(env: V2VEnv, seeds: jax.Array, episodes: jax.Array) -> tuple[EnvState
 
 @jax.jit
 def _step(env: V2VEnv, state: EnvState, actions: jax.Array) -> tuple[EnvState, Told]:
-    after = jax.vmap(env.step, in_axes=-1, out_axes=-1)(state, actions.T)
-    finite = jnp.isfinite(after.obs).all(0) & jnp.isfinite(after.reward)
-    shown = lambda s: (s.obs, s.reward, s.metrics)  # noqa: E731
-    obs, reward, metrics = _pick(finite, shown(after), shown(state))
-    metrics = dataclasses.replace(metrics, valid=after.metrics.valid & finite)
-    state = dataclasses.replace(after, obs=obs, reward=reward, metrics=metrics)
+    state = jax.vmap(partial(finite_step, env), in_axes=-1, out_axes=-1)(state, actions.T)
     return state, _tell(state)
 
 
@@ -137,7 +133,7 @@ def _to_numpy(told: Told) -> Told:
     return jax.tree.map(np.array, jax.device_get(told))
 
 
-@functools.cache
+@cache
 def _task(env: EnvConfig, motion: MotionConfig, split: Literal["train", "test"]) -> V2VEnv:
     """Shared by all environments of a process with the same settings: the tables are large."""
     return make_env(env, motion, split=split)
@@ -169,15 +165,19 @@ class V2V(gymnasium.Env[np.ndarray, np.ndarray]):
 
     metadata = {"render_modes": [], "render_fps": round(1 / CONTROL_DT_S)}
 
-    def __init__(self, *, test: bool = False, **settings: Any) -> None:
+    def __init__(
+        self, *, test: bool = False, render_mode: str | None = None, **settings: Any
+    ) -> None:
         """Settings: fields of EnvConfig and MotionConfig.
 
         Args:
             test: the motion that training never sees.
+            render_mode: without effect, as nothing is drawn; learners' helpers pass one unasked.
 
         Raises:
             UserError: an unknown or impossible setting.
         """
+        del render_mode
         env = _make_task(test, settings)
         self.observation_space, self.action_space = _spaces(env)
         self._episodes = Episodes(env, 1)
