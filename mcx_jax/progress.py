@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, TextIO
 
 from mcx_jax.config import TrainConfig
+from mcx_jax.results import paper_means
 
 PLAIN_INTERVAL_S = 10.0
 """Seconds between lines where the output is no terminal."""
@@ -21,6 +22,19 @@ def short_time(seconds: float) -> str:
     if whole < 3600:
         return f"{whole // 60} min {whole % 60:02d} s"
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def references(config: TrainConfig) -> tuple[str, str]:
+    """What to print beside dp and da: table 3's IK baseline and agents, for the seas of the run.
+
+    ("", "") where table 3 has none: another arm, delay, sea or motion.
+    """
+    env, motion = config.env, config.motion
+    ik, paper = (paper_means(who, env.delay, motion.sea) for who in ("ik", "paper"))
+    if ik is None or paper is None or env.arm != "paper" or motion.motion or motion.coupled:
+        return "", ""
+    position, angle = (f" (IK {a:.2f}, paper {b:.2f})" for a, b in zip(ik, paper, strict=True))
+    return position, angle
 
 
 @dataclass
@@ -49,19 +63,23 @@ class Progress:
         self.out.flush()
 
     def line(self, rows: list[dict[str, Any]]) -> str:
-        """One line: how far, how fast, how good (errors include the exploration noise)."""
+        """One line: how good, how far, how fast; the end is cut off on a narrow terminal.
+
+        The errors include the exploration noise and an episode's first second, which the IK
+        baseline and the paper's agents beside them do not.
+        """
         iteration, total = rows[0]["iteration"], self.config.iterations
         elapsed = max(time.monotonic() - self.begun, 1e-9)
         done = iteration - self.start_iteration
         rate = done * self.config.steps_per_iteration * self.config.seeds / elapsed
         left = (total - iteration) * elapsed / max(done, 1)
-        position = " ".join(f"{row['pos_error_mm']:.3f}" for row in rows)
-        angle = " ".join(f"{row['ang_error_mrad']:.3f}" for row in rows)
-        noise = f"sigma {rows[0]['sigma']:.3f} | " if "sigma" in rows[0] else ""
+        position = " ".join(f"{row['pos_error_mm']:.2f}" for row in rows)
+        angle = " ".join(f"{row['ang_error_mrad']:.2f}" for row in rows)
+        beside = references(self.config)
+        noise = f" | sigma {rows[0]['sigma']:.3f}" if "sigma" in rows[0] else ""
         return (
-            f"iteration {iteration}/{total} | {rows[0]['steps'] / 1e6:.2f} M steps | "
-            f"{rate:,.0f} steps/s | {position} mm {angle} mrad | "
-            f"{noise}ETA {short_time(left)}"
+            f"{iteration}/{total} | dp {position} mm{beside[0]} | da {angle} mrad{beside[1]} | "
+            f"ETA {short_time(left)} | {rows[0]['steps'] / 1e6:.2f} M steps, {rate:,.0f}/s{noise}"
         )
 
     def _warn(self, rows: list[dict[str, Any]]) -> None:

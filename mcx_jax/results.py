@@ -90,3 +90,12 @@ def paper_errors(who: str, delay: str, sea: str) -> tuple[float, float] | None:
     if who == "ik":
         return cell["ik_pos_mm_implied"], cell["ik_ang_mrad_implied"]
     return cell["pos_mm_mean"], cell["ang_mrad_mean"]
+
+
+def paper_means(who: str, delay: str, sea: str) -> tuple[float, float] | None:
+    """`paper_errors`; for the sea `all` the mean over the paper's four."""
+    seas = [s for d, s in table3() if d == delay and sea in ("all", s)]
+    cells = [cell for s in seas if (cell := paper_errors(who, delay, s))]
+    if not cells:
+        return None
+    return sum(mm for mm, _ in cells) / len(cells), sum(mrad for _, mrad in cells) / len(cells)

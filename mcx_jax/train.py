@@ -4,22 +4,22 @@ Writes DIR/{config.json, metrics.jsonl, checkpoints/, policy.npz}. The command l
 directory checked before anything is computed, so that a mistake is told at once.
 """
 
+import contextlib
 import functools
 import os
-import signal
 import sys
 import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import FrameType
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal
 
-from mcx_jax import checkpoint, cli, machine
+from mcx_jax import checkpoint, cli, machine, tensorboard
 from mcx_jax.config import TrainConfig, preset_config
 from mcx_jax.progress import Progress, short_time
 from mcx_jax.run_dir import POLICY, RunDir, default_path, open_existing, open_new, stored_config
+from mcx_jax.stop import StopRequest
 
 if TYPE_CHECKING:
     from mcx_jax.policy import Policy
@@ -44,6 +44,8 @@ class TrainCommand:
     """Try the whole path on a tiny run (a minute), in a temporary directory unless --run-dir."""
     device: Literal["auto", "cpu", "gpu"] = "auto"
     """Where to compute."""
+    tensorboard: bool = False
+    """Also write TensorBoard event files into the run's directory (extra viz)."""
     train: TrainConfig = field(default_factory=TrainConfig)
 
 
@@ -91,31 +93,6 @@ def _directory(command: TrainCommand) -> Path:
     if command.smoke:
         return Path(tempfile.mkdtemp(prefix="mcx_jax-smoke-"))
     return default_path(command.train)
-
-
-@dataclass
-class StopRequest:
-    """Turns the first SIGINT or SIGTERM into a request; the second acts as usual."""
-
-    signum: int = 0
-    previous: dict[int, Any] = field(default_factory=dict)
-
-    def __enter__(self) -> Self:
-        """Listen."""
-        for signum in (signal.SIGINT, signal.SIGTERM):
-            self.previous[signum] = signal.signal(signum, self._note)
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        """Give the signals back."""
-        for signum, handler in self.previous.items():
-            signal.signal(signum, handler)
-
-    def _note(self, signum: int, frame: FrameType | None) -> None:
-        del frame
-        self.signum = signum
-        signal.signal(signum, self.previous[signum])
-        print("\nstopping at the end of this iteration (again: at once)", flush=True)
 
 
 def metric_rows(
@@ -182,7 +159,13 @@ def save(run: RunDir, state: "TrainState", rows: list[dict[str, Any]]) -> "tuple
     return policies[best], policies[best].meta.seed
 
 
-def iterate(run: RunDir, training: "Training", state: "TrainState", stop: StopRequest) -> "Policy":
+def iterate(
+    run: RunDir,
+    training: "Training",
+    state: "TrainState",
+    stop: StopRequest,
+    events: "tensorboard.EventFile | None",
+) -> "Policy":
     """Train to the end, or to the first iteration after a request to stop.
 
     Returns:
@@ -195,6 +178,8 @@ def iterate(run: RunDir, training: "Training", state: "TrainState", stop: StopRe
         state, metrics = training.iterate(state, iteration - 1)
         rows = metric_rows(config, iteration, metrics)
         run.append([{**row, "wall_s": time.monotonic() - progress.begun} for row in rows])
+        if events:
+            events.append(rows)
         progress.show(rows)
         if stop.signum:
             break
@@ -207,11 +192,12 @@ def iterate(run: RunDir, training: "Training", state: "TrainState", stop: StopRe
     return policy
 
 
-def train(run: RunDir, make_env: Callable[..., Any]) -> "Policy":
+def train(run: RunDir, make_env: Callable[..., Any], *, events: bool = False) -> "Policy":
     """Build the environment, compile, and train.
 
     Args:
         make_env: (env_config, motion_config, split="train") -> environment.
+        events: write event files for TensorBoard, too.
 
     Raises:
         UserError: the arm, the motion or the checkpoint cannot be used.
@@ -236,8 +222,13 @@ def train(run: RunDir, make_env: Callable[..., Any]) -> "Policy":
     run.create()
     if run.start_iteration:
         print(f"going on after iteration {run.start_iteration}")
-    with StopRequest() as stop:
-        policy = iterate(run, training, state, stop)
+    with contextlib.ExitStack() as stack:
+        file = None
+        if events:
+            file = tensorboard.EventFile(run.path, config, run.start_iteration)
+            stack.enter_context(file)
+        stop = stack.enter_context(StopRequest())
+        policy = iterate(run, training, state, stop, file)
     if stop.signum and policy.meta.iteration < config.iterations:
         print(f"saved; go on with: python -m mcx_jax.train --run-dir {run.path} --resume")
         raise SystemExit(128 + stop.signum)
@@ -280,6 +271,8 @@ def main(argv: list[str] | None = None) -> None:
     from mcx_jax import startup
 
     command, run = read_command(list(sys.argv[1:] if argv is None else argv))
+    if command.tensorboard:
+        tensorboard.require()
     if command.smoke:
         print(compile_quickly())
     for line in startup.configure(command.device, mjx=run.config.env.physics == "mjx"):
@@ -290,7 +283,7 @@ def main(argv: list[str] | None = None) -> None:
     from mcx_jax.envs.v2v import make_env
 
     try:
-        policy = train(run, make_env)
+        policy = train(run, make_env, events=command.tensorboard)
     except KeyboardInterrupt:
         print("\nstopped before the end of an iteration; go on with --resume if a run had begun")
         raise SystemExit(130) from None

@@ -1,0 +1,51 @@
+"""Event files for TensorBoard beside metrics.jsonl (`train --tensorboard`; extra `viz`)."""
+
+import importlib.util
+from pathlib import Path
+from typing import Any, Self
+
+from mcx_jax.config import TrainConfig
+from mcx_jax.errors import UserError
+
+
+def require() -> None:
+    """Refuse, before anything is computed, where the package is missing."""
+    if importlib.util.find_spec("tensorboardX") is None:
+        raise UserError("--tensorboard needs tensorboardX: install the 'viz' extra or leave it out")
+
+
+class EventFile:
+    """One event file of a run; a run that is gone on with gets another one beside it."""
+
+    def __init__(self, path: Path, config: TrainConfig, start_iteration: int) -> None:
+        """Open a new file in the run's directory.
+
+        Args:
+            start_iteration: what was written after it is hidden: it will be written again.
+        """
+        from tensorboardX import SummaryWriter
+
+        self._seeds = config.seeds
+        first = start_iteration * config.steps_per_iteration + 1
+        # Names hold the second only: a run gone on with at once would overwrite the first file.
+        suffix = f".{start_iteration}"
+        self._writer = SummaryWriter(str(path), purge_step=first, filename_suffix=suffix)
+
+    def __enter__(self) -> Self:
+        """Itself."""
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        """Write what is left."""
+        self._writer.close()
+
+    def append(self, rows: list[dict[str, Any]]) -> None:
+        """Add an iteration's rows of metrics.jsonl: a curve per metric over control steps, with
+        several seeds under seed<n>/."""
+        for row in rows:
+            under = f"seed{row['seed']}/" if self._seeds > 1 else ""
+            for name, value in row.items():
+                if name not in ("iteration", "steps", "seed"):
+                    self._writer.add_scalar(under + name, value, row["steps"])
+        # A killed run goes on from a checkpoint: no point before it may be missing.
+        self._writer.flush()

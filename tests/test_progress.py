@@ -1,0 +1,154 @@
+"""What a training run shows: the line of progress beside table 3, and TensorBoard's event files."""
+
+import io
+import json
+import os
+import signal
+import struct
+from dataclasses import replace
+
+import pytest
+from probe_envs import make_probe
+from tensorboardX.proto.event_pb2 import Event, SessionLog
+
+from mcx_jax import startup
+from mcx_jax.config import EnvConfig, MotionConfig, preset_config
+from mcx_jax.progress import Progress, references
+from mcx_jax.results import paper_means
+from mcx_jax.run_dir import open_existing, open_new
+from mcx_jax.train import main, train
+
+FAST = preset_config("fast")
+TINY = replace(
+    FAST,
+    num_envs=8,
+    total_steps=8 * 8 * 4,
+    env=EnvConfig(episode_steps=16),
+    ppo=replace(FAST.ppo, window_steps=8, sequence_steps=4, minibatches=2, hidden=8),
+)
+ROW = {"iteration": 3, "steps": 196608, "pos_error_mm": 2.3456, "ang_error_mrad": 1.2345}
+
+
+def _config(delay="B4_4", sea="all", **motion):
+    return replace(
+        FAST, env=EnvConfig(delay, episode_steps=1024), motion=MotionConfig(sea=sea, **motion)
+    )
+
+
+def test_means_over_the_seas():
+    # Table 3, E0: (0.93 + 1.40 + 1.82 + 2.18) / 4 and so on, by hand.
+    assert paper_means("ik", "E0", "all") == pytest.approx((1.5825, 1.695))
+    assert paper_means("paper", "E0", "all") == pytest.approx((0.4825, 0.645))
+    assert paper_means("paper", "E0", "Wb") == (0.42, 0.57)
+    assert paper_means("ik", "E3", "all") is None and paper_means("ik", "E0", "3:11") is None
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        _config("E3"),
+        _config(sea="3.0:11"),
+        _config(coupled=True),
+        _config(motion="waves.npy"),
+        replace(FAST, env=EnvConfig(arm="ur10e", episode_steps=1024)),
+    ],
+)
+def test_no_reference_where_table_3_has_none(config):
+    assert references(config) == ("", "")
+
+
+def test_line_says_how_good_that_is():
+    line = Progress(_config(), start_iteration=0, out=io.StringIO()).line([ROW])
+    begin = "3/306 | dp 2.35 mm (IK 5.88, paper 0.71) | da 1.23 mrad (IK 4.72, paper 0.73) | ETA "
+    assert line.startswith(begin)
+    assert "| 0.20 M steps, " in line and "\n" not in line and "sigma" not in line
+    assert " | sigma 0.300" in Progress(_config(), 0).line([{**ROW, "sigma": 0.3}])
+    line = Progress(replace(_config("E3"), seeds=2), 0).line([ROW, {**ROW, "pos_error_mm": 4.0}])
+    assert line.startswith("3/306 | dp 2.35 4.00 mm | da 1.23 1.23 mrad | ETA ")
+
+
+def _make_env(env_config, motion_config, split):
+    return make_probe(scale=0.01)
+
+
+def _events(path):
+    """Events of a file: records of length (8 bytes), its checksum (4), data, checksum (4)."""
+    content, at = path.read_bytes(), 0
+    while at < len(content):
+        (size,) = struct.unpack_from("<Q", content, at)
+        yield Event.FromString(content[at + 12 : at + 12 + size])
+        at += size + 16
+
+
+def _curves(run):
+    """{tag: [(step, value)]} as TensorBoard shows them: a start hides what is at or after it."""
+    curves = {}
+    for file in sorted(run.glob("events.out.tfevents.*")):
+        for event in _events(file):
+            if event.session_log.status == SessionLog.START:
+                for points in curves.values():
+                    points[:] = [point for point in points if point[0] < event.step]
+            for value in event.summary.value:
+                curves.setdefault(value.tag, []).append((event.step, value.simple_value))
+    return curves
+
+
+def _stop_at(monkeypatch, iteration):
+    show = Progress.show
+
+    def show_and_stop(self, rows):
+        show(self, rows)
+        if rows[0]["iteration"] == iteration:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    monkeypatch.setattr(Progress, "show", show_and_stop)
+
+
+def test_event_files_hold_every_point_once(tmp_path, monkeypatch):
+    path = tmp_path / "run"
+    with monkeypatch.context() as patch, pytest.raises(SystemExit):
+        _stop_at(patch, 2)
+        train(open_new(path, TINY), _make_env, events=True)
+    assert [step for step, _ in _curves(path)["reward"]] == [64, 128]
+    # As if killed after an iteration beyond the checkpoint: that one will be written again.
+    with monkeypatch.context() as patch:
+        patch.setattr("mcx_jax.train.save", lambda run, state, rows: _no_save())
+        with pytest.raises(RuntimeError, match="killed"):
+            train(open_existing(path, TINY), _make_env, events=True)
+    train(open_existing(path, TINY), _make_env, events=True)
+    rows = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+    curves = _curves(path)
+    assert {*curves, "iteration", "steps", "seed", "wall_s"} == set(rows[0])
+    for tag, points in curves.items():
+        assert [step for step, _ in points] == [64, 128, 192, 256], tag
+        assert [value for _, value in points] == pytest.approx(
+            [row[tag] for row in rows], rel=1e-6, nan_ok=True
+        ), tag
+
+
+def _no_save():
+    raise RuntimeError("killed")
+
+
+def test_several_seeds_have_curves_of_their_own(tmp_path):
+    train(open_new(tmp_path / "run", replace(TINY, seeds=2, seed=5)), _make_env, events=True)
+    curves = _curves(tmp_path / "run")
+    assert {"seed5/reward", "seed6/reward"} <= set(curves)
+    assert [step for step, _ in curves["seed6/reward"]] == [64, 128, 192, 256]
+
+
+def test_no_event_file_unless_asked(tmp_path):
+    train(open_new(tmp_path / "run", TINY), _make_env)
+    assert not list((tmp_path / "run").glob("events*"))
+
+
+def test_missing_package_is_told_at_once(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("mcx_jax.tensorboard.importlib.util.find_spec", lambda name: None)
+    with pytest.raises(SystemExit) as stop:
+        startup.run_command(lambda: main(["--tensorboard"]))
+    assert stop.value.code == 2
+    assert capsys.readouterr().err == (
+        "error: --tensorboard needs tensorboardX: install the 'viz' extra or leave it out\n"
+    )
+    assert not list(tmp_path.iterdir())
