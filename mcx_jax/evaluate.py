@@ -60,9 +60,13 @@ def run_episodes(env, controller, keys, seas, gain):
             that baseline and controller share one program (compiling takes ten times the run).
 
     Returns:
-        dp (steps, N) m, da (steps, N) rad, valid (N,) bool.
+        dp (steps, N) m, da (steps, N) rad, valid (N,) bool, correction (steps, 6, N) in cm and
+        crad, and the largest share of its torque limit that a joint uses, (steps, N).
     """
     import jax
+    import jax.numpy as jnp
+
+    from mcx_jax.envs.model import torque_limits_nm
 
     reset = jax.vmap(lambda k, s: env.reset(k, s), in_axes=0, out_axes=-1)
     step = jax.vmap(env.step, in_axes=-1, out_axes=-1)
@@ -73,11 +77,18 @@ def run_episodes(env, controller, keys, seas, gain):
     def body(carry, _):
         state, memory = carry
         memory, action = act(state, memory)
-        state = step(state, gain * action)
-        return (state, memory), (state.metrics.pos_error_m, state.metrics.ang_error_rad)
+        action = jnp.clip(gain * action, -bound, bound)
+        after = step(state, action)
+        share = jnp.max(jnp.abs(torques(state, after)) / limits, axis=0)
+        errors = after.metrics.pos_error_m, after.metrics.ang_error_rad
+        return (after, memory), (*errors, action, share)
 
-    (state, _), (dp, da) = jax.lax.scan(body, (state, memory), None, env.episode_steps)
-    return dp, da, state.metrics.valid
+    bound = env.config.max_correction
+    limits = torque_limits_nm(env.model)[:, None]
+    torques = jax.vmap(env.joint_torques, in_axes=-1, out_axes=-1)
+    (state, _), series = jax.lax.scan(body, (state, memory), None, env.episode_steps)
+    dp, da, action, share = series
+    return dp, da, state.metrics.valid, action, share
 
 
 @functools.cache
@@ -95,7 +106,7 @@ def episode_errors(env, controller, gains: tuple[float, ...], episodes: int, see
     a difference is the controller's or the sea's alone.
 
     Returns:
-        (dp m, da rad, valid) of shapes (steps, gains, seas, episodes), the same, and without steps.
+        `Series` with leaves (steps, gains, seas, episodes), valid without steps.
     """
     import jax
     import jax.numpy as jnp
@@ -110,8 +121,32 @@ def episode_errors(env, controller, gains: tuple[float, ...], episodes: int, see
     env, controller = put(mesh, (env, controller))
     keys, seas, gain = put(mesh, (keys, seas, gain), 0)
     with jax.set_mesh(mesh):
-        dp, da, valid = jax.device_get(_compiled()(env, controller, keys, seas, gain))
-    return dp.reshape(-1, *shape), da.reshape(-1, *shape), valid.reshape(shape)
+        dp, da, valid, action, share = jax.device_get(
+            _compiled()(env, controller, keys, seas, gain)
+        )
+    return Series(
+        pos_m=dp.reshape(-1, *shape),
+        ang_rad=da.reshape(-1, *shape),
+        valid=valid.reshape(shape),
+        correction=action.reshape(-1, 6, *shape),
+        torque_share=share.reshape(-1, *shape),
+    )
+
+
+@dataclass(frozen=True)
+class Series:
+    """What `episode_errors` records, NumPy; see there for the axes that follow."""
+
+    pos_m: Any
+    """dp (steps, ...)."""
+    ang_rad: Any
+    """da (steps, ...)."""
+    valid: Any
+    """(...) bool."""
+    correction: Any
+    """(steps, 6, ...) cm and crad."""
+    torque_share: Any
+    """(steps, ...) largest share of its limit that a joint's torque has, 1 = at the limit."""
 
 
 @dataclass(frozen=True)
@@ -127,13 +162,18 @@ class Errors:
     """da (steps, seas, episodes)."""
     valid: Any
     """(seas, episodes) bool."""
+    correction: Any
+    """(steps, 6, seas, episodes) cm and crad."""
+    torque_share: Any
+    """(steps, seas, episodes), 1 = at the limit."""
 
     def rows(self) -> list[dict[str, Any]]:
         """One result row a sea (without the improvement)."""
-        from mcx_jax.results import row
+        from mcx_jax.results import effort, row
 
         return [
             row(self.who, self.delay, sea, self.pos_m[:, i], self.ang_rad[:, i], self.valid[i])
+            | effort(self.correction[:, :, i], self.torque_share[:, i])
             for i, sea in enumerate(self.seas)
         ]
 
@@ -175,9 +215,18 @@ def informed(env, known_delay: str):
 def errors_beside_ik(who: str, controller: Any, env, *, episodes: int, seed: int) -> list[Errors]:
     """Errors of the IK baseline and of a controller on the same episodes; `ik` runs alone."""
     names = ("ik",) if who == "ik" else ("ik", who)
-    dp, da, valid = episode_errors(env, controller, (0.0, 1.0)[: len(names)], episodes, seed)
+    found = episode_errors(env, controller, (0.0, 1.0)[: len(names)], episodes, seed)
     return [
-        Errors(name, env.config.delay, env.motion.seas, dp[:, k], da[:, k], valid[k])
+        Errors(
+            who=name,
+            delay=env.config.delay,
+            seas=env.motion.seas,
+            pos_m=found.pos_m[:, k],
+            ang_rad=found.ang_rad[:, k],
+            valid=found.valid[k],
+            correction=found.correction[:, :, k],
+            torque_share=found.torque_share[:, k],
+        )
         for k, name in enumerate(names)
     ]
 
@@ -261,7 +310,24 @@ def print_table(rows: list[dict[str, Any]], file=None) -> None:
             f"{published[1]:.2f}" if published else "-",
             f"{r['invalid_episodes']}/{r['episodes']}",
         )
-    Console(file=file, width=None if (file or sys.stdout).isatty() else 150).print(table)
+    console = Console(file=file, width=None if (file or sys.stdout).isatty() else 150)
+    console.print(table)
+    for who in dict.fromkeys(r["who"] for r in rows):
+        console.print(_effort_line(who, [r for r in rows if r["who"] == who]), highlight=False)
+
+
+def _effort_line(who: str, rows: list[dict[str, Any]]) -> str:
+    """The largest correction and the use of the torque limits over all seas."""
+    corrections = [r["correction"] for r in rows]
+    most = {name: max(c[name] for c in corrections) for name in corrections[0]}
+    share = max(r["torque_share"]["mean"] for r in rows)
+    limited = max(r["torque_share"]["at_limit"] for r in rows)
+    return (
+        f"{who}, worst sea: correction up to {most['max_cm']:.2f} cm {most['max_crad']:.2f} crad, "
+        f"mean rate {most['rate_cm_s']:.1f} cm/s {most['rate_crad_s']:.1f} crad/s; most loaded "
+        f"joint at {100 * share:.0f} % of its torque limit on average, {100 * limited:.1f} % of "
+        "the steps at the limit"
+    )
 
 
 def policy_path(who: str) -> Path | None:

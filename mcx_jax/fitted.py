@@ -128,6 +128,6 @@ def _score(env: V2VEnv, controller: Any) -> float:
     """Mean of dp and da (m + rad) over training episodes, the reward's own measure."""
     from mcx_jax.evaluate import episode_errors
 
-    dp, da, _ = episode_errors(env, controller, (1.0,), 8, FIT_SEED)
+    found = episode_errors(env, controller, (1.0,), 8, FIT_SEED)
     warm = round(1.0 / CONTROL_DT_S)
-    return float(np.mean(dp[warm:]) + np.mean(da[warm:]))
+    return float(np.mean(found.pos_m[warm:]) + np.mean(found.ang_rad[warm:]))

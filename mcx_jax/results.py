@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from mcx_jax.config import CONTROL_DT_S
 from mcx_jax.errors import UserError
 from mcx_jax.paper import table3
 
@@ -63,6 +64,30 @@ def row(
         "invalid_episodes": int((~valid).sum()),
         "pos_mm": error_statistics(1e3 * pos_m[WARM_UP_STEPS:, finite]),
         "ang_mrad": error_statistics(1e3 * ang_rad[WARM_UP_STEPS:, finite]),
+    }
+
+
+def effort(correction: np.ndarray, torque_share: np.ndarray) -> dict[str, Any]:
+    """What the tracking costs, over all points after the warm-up that are finite.
+
+    Args:
+        correction: (steps, 6, episodes), cm and crad.
+        torque_share: (steps, episodes) of the joint nearest its torque limit, 1 = at it.
+    """
+    shift, turn = correction[WARM_UP_STEPS:, :3], correction[WARM_UP_STEPS:, 3:]
+    share = torque_share[WARM_UP_STEPS:]
+    rate = lambda x: float(np.nanmean(np.linalg.norm(np.diff(x, axis=0), axis=1)) / CONTROL_DT_S)  # noqa: E731
+    return {
+        "correction": {
+            "max_cm": float(np.nanmax(np.abs(shift))),
+            "max_crad": float(np.nanmax(np.abs(turn))),
+            "rate_cm_s": rate(shift),
+            "rate_crad_s": rate(turn),
+        },
+        "torque_share": {
+            "mean": float(np.nanmean(share)),
+            "at_limit": float(np.nanmean(share > 1.0 - 1e-6)),
+        },
     }
 
 

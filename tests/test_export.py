@@ -343,7 +343,7 @@ def both_worlds(policy, arm, delay, runner, count, steps):
     compiled = jax.jit(run_episodes, compiler_options=arms.QUICK)
     seas, gain = jnp.zeros(2 * count, jnp.int32), jnp.repeat(jnp.array([0.0, 1.0]), count)
     found = compiled(env, PolicyController(policy), jnp.concatenate([keys, keys]), seas, gain)
-    (dp, da, valid), (track, goal_m) = jax.device_get((found, drawn(env.motion, keys)))
+    (dp, da, valid, *_), (track, goal_m) = jax.device_get((found, drawn(env.motion, keys)))
     assert valid.all()
     table_a, table_b = np.asarray(env.motion.knots_a), np.asarray(env.motion.knots_b)
     path = arm if arm.endswith(".xml") else moving_base.arm_path(arm)

@@ -14,6 +14,7 @@ import pytest
 
 from mcx_jax import cli
 from mcx_jax.config import EnvConfig, MotionConfig, TrainConfig
+from mcx_jax.envs.model import torque_limits_nm
 from mcx_jax.errors import UserError
 from mcx_jax.evaluate import (
     errors_beside_ik,
@@ -27,7 +28,7 @@ from mcx_jax.ppo.networks import init_params
 from mcx_jax.ppo.normalise import init_stats
 from mcx_jax.report import entries, style
 from mcx_jax.report.__main__ import check_out, main
-from mcx_jax.report.episode import lag_s, record, torque_limits_nm
+from mcx_jax.report.episode import lag_s, record
 from mcx_jax.report.spectra import motion_spectra
 
 STEPS, EPISODES, SEED = 90, 2, 3

@@ -309,3 +309,12 @@ def _vec(v: np.ndarray) -> Vec:
 
 def _mat(m: np.ndarray) -> Mat:
     return (_vec(m[0]), _vec(m[1]), _vec(m[2]))
+
+
+def torque_limits_nm(model: ChainModel) -> np.ndarray:
+    """(nq,) most that a joint's actuators give together; infinite where one has no limit."""
+    limits = np.zeros(model.nq)
+    for act in model.actuators:
+        most = max(map(abs, act.force_range)) if act.force_range else np.inf
+        limits[act.joint] += abs(act.gear) * most
+    return limits

@@ -195,8 +195,7 @@ class V2VEnv:
             found = ik.solve(self.model, state.arm.q, target, ik.WARM_ITERATIONS, self.wall)
         with jax.named_scope("lag"):
             lag_state, reference = lag.apply_one(self.delays, drawn.delay, state.lag, found.q)
-            rate = (reference - state.reference) / CONTROL_DT_S
-            rate = jnp.where(state.step == 0, 0.0, rate)
+            rate = _rate(state, reference)
         with jax.named_scope("vessels"):
             seg_a, seg_b = self._segments(state.track, state.step)
             place = self.goal_on_deck(state.goal_m, drawn, (state.step + 1) * SUBSTEPS)
@@ -237,6 +236,14 @@ class V2VEnv:
         """The TRUE pose T_G^B a number of physics steps after now."""
         step = state.step * SUBSTEPS + steps
         return self.goal_at(state.track, state.goal_m, state.conditions, step)
+
+    def joint_torques(self, before: EnvState, after: EnvState) -> jax.Array:
+        """(nq,) torques of the servos at the end of the control step between two states, N m."""
+        rate = _rate(before, after.reference)
+        ctrl = command(self.model, after.reference, rate)
+        angles, rates = unpack(after.arm.q, self.model.nq), unpack(after.arm.qd, self.model.nq)
+        commands = unpack(ctrl, len(self.model.actuators))
+        return jnp.stack(chain.actuate(self.model, angles, rates, commands)[0])
 
     def _observe(
         self, arm: ArmState, goal: tuple[Mat, Vec], measured: Measurement, drawn: Conditions
@@ -283,6 +290,12 @@ class V2VEnv:
 
             q, qd = mjx_engine.substeps(self.mjx_model, arm.q, arm.qd, ctrl, base_at, count)
         return ArmState(q=q, qd=qd)
+
+
+def _rate(before: EnvState, reference: jax.Array) -> jax.Array:
+    """(nq,) finite difference of the late reference, rad/s; 0 in the first step (authors' code)."""
+    rate = (reference - before.reference) / CONTROL_DT_S
+    return jnp.where(before.step == 0, 0.0, rate)
 
 
 def correct(goal: tuple[Mat, Vec], action: jax.Array) -> tuple[Mat, Vec]:

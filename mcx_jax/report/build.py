@@ -11,6 +11,7 @@ import numpy as np
 
 from mcx_jax import machine
 from mcx_jax.config import CONTROL_DT_S
+from mcx_jax.envs.model import torque_limits_nm
 from mcx_jax.evaluate import (
     Errors,
     errors_beside_ik,
@@ -20,7 +21,7 @@ from mcx_jax.evaluate import (
 )
 from mcx_jax.report import sections, style
 from mcx_jax.report.entries import Entry, learning_curves
-from mcx_jax.report.episode import record, torque_limits_nm
+from mcx_jax.report.episode import record
 from mcx_jax.report.page import page
 from mcx_jax.report.sections import Section
 from mcx_jax.report.spectra import motion_spectra

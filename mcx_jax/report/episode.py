@@ -12,9 +12,8 @@ import numpy as np
 from flax import struct
 
 from mcx_jax.config import CONTROL_DT_S
-from mcx_jax.envs import chain, ik
-from mcx_jax.envs.model import ChainModel
-from mcx_jax.envs.v2v import EnvState, V2VEnv, command
+from mcx_jax.envs import ik
+from mcx_jax.envs.v2v import EnvState, V2VEnv
 from mcx_jax.spatial import unpack
 
 
@@ -84,10 +83,6 @@ def _roll_out(env: V2VEnv, controller: Any, key, sea, gains) -> Episode:
 def _sample(env: V2VEnv, before: EnvState, after: EnvState, action: jax.Array) -> Episode:
     model = env.model
     angles = unpack(after.arm.q, model.nq)
-    # As `step` gives it to the servos.
-    rate = jnp.where(before.step == 0, 0.0, (after.reference - before.reference) / CONTROL_DT_S)
-    ctrl = command(model, after.reference, rate)
-    rates, commands = unpack(after.arm.qd, model.nq), unpack(ctrl, len(model.actuators))
     return Episode(
         goal_m=jnp.stack(env.goal_ahead(after, 0)[1]),
         reference_m=jnp.stack(ik.tool_pose(model, unpack(after.reference, model.nq))[1]),
@@ -95,17 +90,8 @@ def _sample(env: V2VEnv, before: EnvState, after: EnvState, action: jax.Array) -
         pos_error_m=after.metrics.pos_error_m,
         ang_error_rad=after.metrics.ang_error_rad,
         correction=action,
-        torque_nm=jnp.stack(chain.actuate(model, angles, rates, commands)[0]),
+        torque_nm=env.joint_torques(before, after),
     )
-
-
-def torque_limits_nm(model: ChainModel) -> np.ndarray:
-    """(nq,) most that a joint's actuators give together; infinite where one has no limit."""
-    limits = np.zeros(model.nq)
-    for act in model.actuators:
-        most = max(map(abs, act.force_range)) if act.force_range else np.inf
-        limits[act.joint] += abs(act.gear) * most
-    return limits
 
 
 LAG_RANGE_S = (-0.2, 1.2)
