@@ -53,7 +53,10 @@ class PlayConfig:
             raise UserError(f"--at {self.at:g}: the episode is {end_s:g} s long; 0 to {end_s:g}")
         if self.video and self.frame:
             raise UserError("--video and --frame: one at a time")
-        for flag, path, ending in (("--video", self.video, ".mp4"), ("--frame", self.frame, ".png")):
+        for flag, path, ending in (
+            ("--video", self.video, ".mp4"),
+            ("--frame", self.frame, ".png"),
+        ):
             if path and Path(path).suffix != ending:
                 raise UserError(f"{flag} {path}: the file's name must end in {ending}")
 

@@ -1,6 +1,7 @@
 """The scene in the browser: the bodies of MuJoCo's model as viser nodes, and patches of water."""
 
 import math
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -94,12 +95,12 @@ def _add_body(server: viser.ViserServer, model: mujoco.MjModel, body: int, root:
             by_material.setdefault(int(model.geom_matid[geom]), []).append(shape)
     for material, shapes in by_material.items():
         rgba = model.mat_rgba[material] if material >= 0 else np.array([0.7, 0.7, 0.7, 1.0])
-        mesh = trimesh.util.concatenate(shapes)
+        mesh: Any = trimesh.util.concatenate(shapes)
         server.scene.add_mesh_simple(
             f"{name}/{material}",
             vertices=np.asarray(mesh.vertices, np.float32),
             faces=np.asarray(mesh.faces),
-            color=tuple(int(255 * x) for x in rgba[:3]),
+            color=np.round(255 * rgba[:3]).astype(np.uint8),
             opacity=float(rgba[3]) if rgba[3] < 1 else None,
             flat_shading=True,
         )

@@ -65,14 +65,9 @@ class Picture:
         camera = "hero" if len(self._take.names) == 1 else "pair"
         wide = Image.fromarray(self._painter.wide(width, PANEL_PX, camera))
         image.paste(wide, (left, TITLE_PX))
-        right, top = left + width - 10, TITLE_PX + 10
-        near = Image.fromarray(self._painter.close_up(CLOSE_UP_PX))
+        top = TITLE_PX + 10
+        inset(image, self._painter.close_up(CLOSE_UP_PX), left + width - 10, top)
         draw = ImageDraw.Draw(image)
-        frame = (right - CLOSE_UP_PX - 2, top - 2, right + 1, top + CLOSE_UP_PX + 22)
-        draw.rounded_rectangle(frame, 4, fill="white")
-        image.paste(near, (right - CLOSE_UP_PX, top))
-        caption = right - CLOSE_UP_PX / 2, top + CLOSE_UP_PX + 10
-        draw.text(caption, "thick: goal   thin: tool", INK, font(14), anchor="mm")
         name = self._take.names[i]
         label = "IK baseline" if name == "ik" else name
         chip(draw, (left + 10, top), label, COLOURS[i], 22)
@@ -102,6 +97,17 @@ class Picture:
                 draw.line(line, COLOURS[i], 3, joint="curve")
             x, y = line[-1]
             draw.ellipse((x - 5, y - 5, x + 5, y + 5), fill=COLOURS[i])
+
+
+def inset(image: Image.Image, close_up: np.ndarray, right: int, top: int) -> None:
+    """Put a close-up (size, size, 3) with its caption into a picture, its right upper corner so."""
+    size = len(close_up)
+    frame = (right - size - 2, top - 2, right + 1, top + size + 22)
+    draw = ImageDraw.Draw(image)
+    draw.rounded_rectangle(frame, 4, fill="white")
+    image.paste(Image.fromarray(close_up), (right - size, top))
+    caption = right - size / 2, top + size + 10
+    draw.text(caption, "thick: goal   thin: tool", INK, font(14), anchor="mm")
 
 
 def chip(draw: ImageDraw.ImageDraw, corner: Sequence[float], text: str, colour: str, size: int):

@@ -1,5 +1,7 @@
 """The page's controls and its loop: simulate what is asked for, then play it in real time."""
 
+import contextlib
+import io
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -53,9 +55,11 @@ class Player:
         self.wanted = Choice(entry.label, config.env.delay, seas[-1], config.episode)
         self.playing = True
         try:
-            self.server = viser.ViserServer(
-                host=config.host, port=config.port, label="mcx_jax", verbose=False
-            )
+            # It prints a box with addresses, asked to be quiet or not; the URL is said once.
+            with contextlib.redirect_stdout(io.StringIO()):
+                self.server = viser.ViserServer(
+                    host=config.host, port=config.port, label="mcx_jax", verbose=False
+                )
         except OSError as error:
             raise UserError(
                 f"--host {config.host} --port {config.port}: cannot be served ({error.strerror})"
@@ -82,12 +86,14 @@ class Player:
         gui.configure_theme(show_logo=False, show_share_button=False, control_layout="collapsible")
         self._said = gui.add_markdown("")
         delays = tuple(dict.fromkeys([*DELAYS, wanted.delay]))
-        who = gui.add_dropdown("controller", whos, wanted.who)
-        delay = gui.add_dropdown("delay", delays, wanted.delay)
-        sea = gui.add_dropdown("sea", seas, wanted.sea)
+        who = gui.add_dropdown("controller", whos, initial_value=wanted.who)
+        delay = gui.add_dropdown("delay", delays, initial_value=wanted.delay)
+        sea = gui.add_dropdown("sea", seas, initial_value=wanted.sea)
         pause = gui.add_button("Pause")
         another = gui.add_button("New episode")
-        self._seek = gui.add_slider("time, s", 0.0, self._end_s, CONTROL_DT_S * STRIDE, 0.0)
+        self._seek = gui.add_slider(
+            "time, s", min=0.0, max=self._end_s, step=CONTROL_DT_S * STRIDE, initial_value=0.0
+        )
         self._controls = [who, delay, sea, another]
         self._note = gui.add_markdown("", order=1000)
         self._sought_s: float | None = None

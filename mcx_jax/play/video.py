@@ -23,9 +23,8 @@ FPS = round(1 / (STRIDE * CONTROL_DT_S))
 
 def title(take: Take, delay_ms: float) -> str:
     """What the picture shows."""
-    return f"Tool on vessel A, goal on vessel B  |  delay {take.delay} ({delay_ms:.0f} ms)" + (
-        f"  |  sea {take.sea}"
-    )
+    what = "Tool on vessel A, goal on vessel B"
+    return f"{what}  |  delay {take.delay} ({delay_ms:.0f} ms)  |  sea {take.sea}"
 
 
 def write_film(
@@ -87,9 +86,7 @@ def _ffmpeg(path: Path) -> Iterator[IO[bytes]]:
             process.kill()
 
 
-def write_frame(
-    path: Path, take: Take, env: EnvConfig, motion: MotionConfig, at_s: float
-) -> None:
+def write_frame(path: Path, take: Take, env: EnvConfig, motion: MotionConfig, at_s: float) -> None:
     """Write the picture of one instant, seconds since the episode's beginning, as a PNG."""
     from PIL import Image
 
@@ -102,26 +99,13 @@ def write_frame(
         raise UserError(f"--frame {path}: cannot be written ({error.strerror})") from None
 
 
-class _picture:  # noqa: N801
-    """`Picture` as a context: the renderer is given back at its end."""
-
-    def __init__(
-        self,
-        take: Take,
-        env: EnvConfig,
-        motion: MotionConfig,
-        steps: np.ndarray,
-        *,
-        fine: bool = False,
-    ):
-        stage = Stage(env)
-        water = surface(take, motion, take.time_s[steps])
-        self._painter = Painter(stage, WIDTH_PX, HEIGHT_PX, fine=fine)
-        line = title(take, 1e3 * env.parsed_delay.group_delay_s)
-        self._made = Picture(take, water, stage, self._painter, line)
-
-    def __enter__(self) -> Picture:
-        return self._made
-
-    def __exit__(self, *_) -> None:
-        self._painter.__exit__()
+@contextlib.contextmanager
+def _picture(
+    take: Take, env: EnvConfig, motion: MotionConfig, steps: np.ndarray, *, fine: bool = False
+) -> Iterator[Picture]:
+    """The pictures of these control steps; the renderer is given back at the end."""
+    stage = Stage(env)
+    water = surface(take, motion, take.time_s[steps])
+    line = title(take, 1e3 * env.parsed_delay.group_delay_s)
+    with Painter(stage, WIDTH_PX, HEIGHT_PX, fine=fine) as painter:
+        yield Picture(take, water, stage, painter, line)
