@@ -55,8 +55,7 @@ class Player:
         self.wanted = Choice(entry.label, config.env.delay, seas[-1], config.episode)
         self.playing = True
         try:
-            # It prints a box with addresses, asked to be quiet or not; the URL is said once.
-            with contextlib.redirect_stdout(io.StringIO()):
+            with _quiet():
                 self.server = viser.ViserServer(
                     host=config.host, port=config.port, label="mcx_jax", verbose=False
                 )
@@ -81,9 +80,15 @@ class Player:
         host = self._config.host
         return f"http://{'localhost' if host == '0.0.0.0' else host}:{self.server.get_port()}"
 
+    def stop(self) -> None:
+        """End the server."""
+        with _quiet():
+            self.server.stop()
+
     def _add_controls(self, whos: list[str], seas: tuple[str, ...]) -> None:
         gui, wanted = self.server.gui, self.wanted
-        gui.configure_theme(show_logo=False, show_share_button=False, control_layout="collapsible")
+        gui.configure_theme(show_logo=False, show_share_button=False)
+        gui.main_panel.dock_right()
         self._said = gui.add_markdown("")
         delays = tuple(dict.fromkeys([*DELAYS, wanted.delay]))
         who = gui.add_dropdown("controller", whos, initial_value=wanted.who)
@@ -244,4 +249,9 @@ def serve(config, entry) -> None:
         print(f"open {player.url} (Ctrl-C ends)", flush=True)
         player.run()
     finally:
-        player.server.stop()
+        player.stop()
+
+
+def _quiet():
+    """viser prints a box with addresses and its end, asked to be quiet or not."""
+    return contextlib.redirect_stdout(io.StringIO())
