@@ -23,7 +23,7 @@ def build_scene(arm: str | Path | None = None) -> mujoco.MjModel:
     """Compile `assets/scene.xml` with an arm on the deck of vessel A, in calm water.
 
     Names of the arm get the prefix "arm/": `model.joint("arm/elbow")`, `data.site("arm/tool")`;
-    mocap bodies are `vessel_a`, `vessel_b`, `goal` and `tool`, cameras `hero` and `side`.
+    mocap bodies are `vessel_a`, `vessel_b`, `goal` and `tool`, cameras `hero` and `pair`.
 
     Args:
         arm: MJCF of the arm; its root is put at the deck origin of vessel A. Default: the paper's.
