@@ -1,28 +1,49 @@
-"""The picture at the head of the README.
+"""The picture at the head of the README: an instant of a test episode, drawn by `mcx_jax.play`.
 
-    MUJOCO_GL=osmesa PYOPENGL_PLATFORM=osmesa python experiments/hero.py
+    python experiments/hero.py
 
-Needs an off-screen OpenGL (Debian: libosmesa6) and matplotlib.
+Controller `extrapolate`, delay B4_4, sea Wd. Needs the extra `viz` and an off-screen OpenGL
+(Debian: libosmesa6).
 """
 
 from pathlib import Path
 
-import mujoco
-from matplotlib import image
+import numpy as np
 
-from mcx_jax.scene import REACH_POSE_RAD, build_scene, pose_scene
+from mcx_jax import startup
+from mcx_jax.config import EnvConfig, MotionConfig
+from mcx_jax.play import gl
+
+EPISODE, AT_S = 0, 12.5
 
 
 def main() -> None:
-    model = build_scene()
-    data = mujoco.MjData(model)
-    pose_scene(model, data, REACH_POSE_RAD)
-    with mujoco.Renderer(model, 720, 1280) as renderer:
-        renderer.update_scene(data, "hero")
-        path = Path(__file__).parents[1] / "docs" / "hero.png"
-        image.imsave(path, renderer.render())
+    gl.choose()
+    startup.configure("cpu")
+    from PIL import Image
+
+    from mcx_jax.controllers import CLASSICAL
+    from mcx_jax.envs.v2v import make_env
+    from mcx_jax.play.episode import simulate
+    from mcx_jax.play.picture import inset
+    from mcx_jax.play.stage import Painter, Stage
+    from mcx_jax.play.waves import surface
+
+    task, motion = EnvConfig(), MotionConfig(sea="Wd")
+    env = make_env(task, motion, split="test")
+    take = simulate(env, "extrapolate", CLASSICAL["extrapolate"], sea=0, episode=EPISODE)
+    step = int(np.abs(take.time_s - AT_S).argmin())
+    stage = Stage(task)
+    stage.place(take.poses[1], step)
+    stage.set_sea(surface(take, motion, take.time_s[[step]]), 0)
+    with Painter(stage, 1280, 720, fine=True) as painter:
+        painter.upload_sea()
+        image = Image.fromarray(painter.wide(1280, 720, "hero"))
+        inset(image, painter.close_up(240), 1280 - 16, 16)
+    path = Path(__file__).parents[1] / "docs" / "hero.png"
+    image.save(path, optimize=True)
     print(f"wrote {path.name}")
 
 
 if __name__ == "__main__":
-    main()
+    startup.run_command(main)

@@ -1,7 +1,7 @@
 """The scene for pictures and films: two vessels at sea, an arm on the first, a goal on the second.
 
-Nothing here takes part in the simulation: the vessels and the goal are mocap bodies and the arm's
-joints are set, not integrated. Poses come from the simulator, pixels from `mujoco.Renderer`.
+Nothing here takes part in the simulation: vessels, goal and tool marker are mocap bodies and the
+arm's joints are set, not integrated. Poses come from the simulator, pixels from `mcx_jax.play`.
 """
 
 from collections.abc import Sequence
@@ -18,22 +18,12 @@ START_POSE_RAD = (-0.1, -1.0, 2.4, -2.9, -1.5, 0.0)
 REACH_POSE_RAD = (-0.271, -1.3039, 2.2268, -2.4937, -1.5708, -0.271)
 """Joint angles (6,) that put the tool on the goal of the scene's rest pose, for still pictures."""
 
-SEA_COMPONENTS = (
-    (2.9, 0.25, 0.26),
-    (1.9, -0.45, 0.22),
-    (1.1, 0.9, 0.16),
-    (0.8, 2.0, 0.12),
-    (0.55, 0.5, 0.09),
-    (0.42, -0.9, 0.07),
-)
-"""Decoration, not a sea state: (length m, direction rad, weight) of the drawn surface's waves."""
-
 
 def build_scene(arm: str | Path | None = None) -> mujoco.MjModel:
-    """Compile `assets/scene.xml` with an arm on the deck of vessel A.
+    """Compile `assets/scene.xml` with an arm on the deck of vessel A, in calm water.
 
     Names of the arm get the prefix "arm/": `model.joint("arm/elbow")`, `data.site("arm/tool")`;
-    mocap bodies are `vessel_a`, `vessel_b` and `goal`, cameras `hero` and `side`.
+    mocap bodies are `vessel_a`, `vessel_b`, `goal` and `tool`, cameras `hero` and `pair`.
 
     Args:
         arm: MJCF of the arm; its root is put at the deck origin of vessel A. Default: the paper's.
@@ -44,14 +34,49 @@ def build_scene(arm: str | Path | None = None) -> mujoco.MjModel:
     scene.option = child.option
     scene.attach(child, site=scene.site("mount"), prefix="arm/")
     sea = scene.hfield("sea")
-    sea.userdata = _drawn_sea(sea.nrow, sea.ncol, 2 * sea.size[0]).ravel()
-    return scene.compile()
+    sea.userdata = np.zeros(sea.nrow * sea.ncol)
+    ripples = scene.texture("ripples")
+    ripples.nchannel = 3
+    ripples.data = np.repeat(_ripples(ripples.width)[..., None], 3, axis=2).tobytes()
+    model = scene.compile()
+    set_sea(model, np.zeros(sea_points_m(model)[0].shape))
+    return model
+
+
+def sea_points_m(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """x and y, (rows, columns) each, of the points of the sea's surface in the world, m."""
+    sea = model.hfield("sea")
+    x_half_m, y_half_m = sea.size[:2]
+    x, y = np.meshgrid(
+        np.linspace(-x_half_m, x_half_m, int(sea.ncol[0])),
+        np.linspace(-y_half_m, y_half_m, int(sea.nrow[0])),
+    )
+    centre = model.geom("sea").pos
+    return x + centre[0], y + centre[1]
+
+
+def set_sea(model: mujoco.MjModel, elevation_m: np.ndarray) -> None:
+    """Write the surface into the model; a renderer has to upload it (`mujoco.mjr_uploadHField`).
+
+    Args:
+        model: from `build_scene`; changed in place.
+        elevation_m: height over the mean water level at `sea_points_m`. What the height field
+            cannot hold, half its range (0.6 m) up or down, is cut off.
+    """
+    range_m = model.hfield("sea").size[2]
+    model.hfield("sea").data[:] = np.clip(elevation_m / range_m + 0.5, 0, 1)
+
+
+def water_level_m(model: mujoco.MjModel) -> float:
+    """Height of the mean water level in the world frame, m."""
+    return float(model.geom("sea").pos[2] + model.hfield("sea").size[2] / 2)
 
 
 def pose_scene(
     model: mujoco.MjModel,
     data: mujoco.MjData,
     q_rad: Sequence[float] | np.ndarray = START_POSE_RAD,
+    tool_site: str = "tool",
     **poses: tuple[np.ndarray, np.ndarray],
 ) -> None:
     """Set joint angles and mocap poses and update everything that the renderer reads.
@@ -60,6 +85,7 @@ def pose_scene(
         model: from `build_scene`.
         data: of that model; changed in place.
         q_rad: joint angles, in the order of the arm's file.
+        tool_site: the arm's site that the marker of frame E is put on.
         **poses: for `vessel_a`, `vessel_b`, `goal`: position (3,) in m and quaternion (4,) wxyz,
             both in the world frame. A body left out stays where it is.
     """
@@ -69,18 +95,25 @@ def pose_scene(
         data.mocap_pos[index] = position_m
         data.mocap_quat[index] = quat_wxyz
     mujoco.mj_kinematics(model, data)
+    marker, site = model.body("tool").mocapid[0], data.site(f"arm/{tool_site}")
+    data.mocap_pos[marker] = site.xpos
+    mujoco.mju_mat2Quat(data.mocap_quat[marker], site.xmat)
+    mujoco.mj_kinematics(model, data)
     mujoco.mj_camlight(model, data)
 
 
-def _drawn_sea(rows: int, columns: int, width_m: float) -> np.ndarray:
-    """Surface elevation (rows, columns) of the drawn sea; MuJoCo scales it to 0..1."""
-    y, x = np.meshgrid(
-        np.linspace(-width_m / 2, width_m / 2, rows),
-        np.linspace(-width_m / 2, width_m / 2, columns),
-        indexing="ij",
-    )
-    elevation = np.zeros((rows, columns))
-    for phase, (length_m, direction_rad, weight) in enumerate(SEA_COMPONENTS):
-        along = x * np.cos(direction_rad) + y * np.sin(direction_rad)
-        elevation += weight * np.sin(2 * np.pi * along / length_m + 1.7 * phase)
-    return elevation
+def _ripples(pixels: int) -> np.ndarray:
+    """Grey pattern (pixels, pixels) uint8 that repeats without a seam: paint, not a sea state.
+
+    The waves of the motion tables end at a length of 0.6 m; bare, the water between looks solid.
+    """
+    rng = np.random.default_rng(7)
+    steps = 2 * np.pi * np.arange(pixels) / pixels
+    pattern = np.zeros((pixels, pixels))
+    for _ in range(90):
+        across, along = rng.integers(-14, 15), rng.integers(3, 27)
+        phase, weight = rng.uniform(0, 2 * np.pi), 1 / (1 + 0.04 * np.hypot(across, along))
+        pattern += weight * np.sin(across * steps[:, None] + along * steps + phase)
+    # Sharp crests, broad troughs.
+    bright = np.exp(0.9 * pattern / pattern.std())
+    return np.clip(178 + 32 * bright / bright.mean() ** 0.5, 0, 255).astype(np.uint8)

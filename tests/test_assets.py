@@ -242,6 +242,6 @@ def test_scene_poses_move_the_arm_with_its_vessel():
 def test_scene_cameras_and_shapes():
     model = scene.build_scene()
     names = {model.camera(i).name for i in range(model.ncam)}
-    assert names == {"hero", "side"}
+    assert names == {"hero", "pair"}
     assert model.body("vessel_a").mocapid[0] >= 0
     np.testing.assert_array_equal(model.geom_contype, 0)

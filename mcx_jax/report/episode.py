@@ -52,18 +52,30 @@ def record(
         sea: index into env.motion.seas.
     """
     key = jax.random.split(jax.random.key(seed), episodes)[episode]
+    return side_by_side(env, controller, key, sea, _sample)
+
+
+def side_by_side(env: V2VEnv, controller: Any, key: jax.Array, sea: int, sample) -> tuple[Any, Any]:
+    """(IK baseline, controller): what `sample` takes from the same episode, NumPy.
+
+    Args:
+        key: of the episode's windows of motion and goal.
+        sea: index into env.motion.seas.
+        sample: (env, state before, state after, action) -> pytree, for ONE episode; its leaves
+            come back with the control steps as axis 0. A function of a module, since a new one
+            compiles anew.
+    """
     gains = jnp.asarray([0.0, 1.0])
-    series = jax.device_get(_compiled()(env, controller, key, jnp.int32(sea), gains))
-    ours = [jax.tree.map(lambda x, k=k: x[..., k], series) for k in range(2)]
-    return ours[0], ours[1]
+    series = jax.device_get(_compiled()(env, controller, key, jnp.int32(sea), gains, sample=sample))
+    return tuple(jax.tree.map(lambda x, k=k: x[..., k], series) for k in range(2))  # type: ignore
 
 
 @functools.cache
 def _compiled():
-    return jax.jit(_roll_out)
+    return jax.jit(_roll_out, static_argnames="sample")
 
 
-def _roll_out(env: V2VEnv, controller: Any, key, sea, gains) -> Episode:
+def _roll_out(env: V2VEnv, controller: Any, key, sea, gains, *, sample):
     """The same episode for each factor of the actions, batch axis last."""
     batched = functools.partial(jax.vmap, in_axes=-1, out_axes=-1)
     state = jax.vmap(lambda _: env.reset(key, sea), out_axes=-1)(gains)
@@ -75,7 +87,7 @@ def _roll_out(env: V2VEnv, controller: Any, key, sea, gains) -> Episode:
         memory, action = act(state, memory)
         action = gains * action
         after = step(state, action)
-        return (after, memory), batched(functools.partial(_sample, env))(state, after, action)
+        return (after, memory), batched(functools.partial(sample, env))(state, after, action)
 
     return jax.lax.scan(body, (state, memory), None, env.episode_steps)[1]
 

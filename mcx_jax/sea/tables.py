@@ -177,7 +177,7 @@ def build_tables(
     """
     knobs = VesselKnobs() if knobs is None else knobs
     if split == "paper":
-        count, seed_role, rows = 1, "train", _paper_rows(role)
+        count, seed_role, rows = 1, "train", paper_rows(role)
     else:
         count = seeds_per_sea or (TRAIN_SEEDS if role == "train" else TEST_SEEDS)
         seed_role, rows = role, slice(None)
@@ -193,7 +193,7 @@ def build_tables(
     )
 
 
-def _paper_rows(role: Role) -> slice:
+def paper_rows(role: Role) -> slice:
     """Rows of the hour that the paper's split gives to a role."""
     border, gap = TABLE_KNOTS * 2 // 3, round(SPLIT_GAP_S / KNOT_DT_S)
     if role == "train":

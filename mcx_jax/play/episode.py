@@ -1,0 +1,126 @@
+"""What is drawn of an episode: poses of vessels and goal in the world, joint angles, errors.
+
+The episode is simulated beforehand, by the program that `evaluate` runs; drawing only reads.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from mcx_jax.config import CONTROL_DT_S, PHYSICS_DT_S, SUBSTEPS
+from mcx_jax.envs import vessels
+from mcx_jax.envs.motion import Motion, Track
+from mcx_jax.envs.v2v import EnvState, V2VEnv
+from mcx_jax.report.episode import side_by_side
+from mcx_jax.spatial import matmul, rotation_rpy, vadd
+
+EPISODES = 50
+"""Episodes to choose from: those of `evaluate` with its default `--episodes`."""
+
+
+@struct.dataclass
+class Poses:
+    """One controller's episode; axis 0 = end of control step 1, 2, ... World frame I unless said.
+
+    Positions (steps, 3) m, rotations (steps, 3, 3), the columns being the frame's axes.
+    """
+
+    a_m: Any
+    """Deck origin of vessel A, which is the arm's base B."""
+    a_rotation: Any
+    b_m: Any
+    """Deck origin of vessel B."""
+    b_rotation: Any
+    goal_m: Any
+    goal_rotation: Any
+    q_rad: Any
+    """(steps, nq) joint angles."""
+    pos_error_m: Any
+    """(steps,) dp."""
+    ang_error_rad: Any
+    """(steps,) da."""
+    seed: Any
+    """(steps,) int32 which of the sea's tables; the same all the time, as the next two."""
+    start_a: Any
+    """(steps,) int32 where vessel A's window begins in the table, physics steps of 2 ms."""
+    start_b: Any
+
+
+@dataclass(frozen=True)
+class Take:
+    """An episode of one or two controllers, ready to be drawn: the same motion, the same goal."""
+
+    names: tuple[str, ...]
+    """What to call them: `ik` alone or `ik` and the other."""
+    poses: tuple[Poses, ...]
+    """Of each."""
+    delay: str
+    """As the environment calls it."""
+    sea: str
+    """Name of the sea state."""
+
+    @property
+    def steps(self) -> int:
+        """Control steps."""
+        return len(self.poses[0].pos_error_m)
+
+    @property
+    def time_s(self) -> np.ndarray:
+        """(steps,) seconds since the episode's beginning."""
+        return CONTROL_DT_S * np.arange(1, self.steps + 1)
+
+    @property
+    def window_starts_s(self) -> tuple[float, float]:
+        """Where the vessels' windows begin in their table, laboratory seconds."""
+        poses = self.poses[0]
+        return PHYSICS_DT_S * int(poses.start_a[0]), PHYSICS_DT_S * int(poses.start_b[0])
+
+
+def simulate(
+    env: V2VEnv, who: str, controller: Any, *, sea: int, seed: int = 0, episode: int = 0
+) -> Take:
+    """One of the test episodes that `evaluate --seed SEED` runs.
+
+    Args:
+        who: what to call the controller; `ik` stands alone.
+        sea: index into env.motion.seas.
+        episode: 0 to EPISODES - 1.
+    """
+    key = jax.random.split(jax.random.key(seed), EPISODES)[episode]
+    both = side_by_side(env, controller, key, sea, _sample)
+    names = ("ik",) if who == "ik" else ("ik", who)
+    return Take(names, both[: len(names)], env.delay.name, env.motion.seas[sea])
+
+
+def vessel_poses(motion: Motion, track: Track, step: jax.Array):
+    """World poses ((R, p) of A, (R, p) of B) at a physics step of the episode (m; rad)."""
+    seg_a = vessels.segment(motion.knots_a, track.table, track.start_a + step)
+    seg_b = vessels.segment(motion.knots_b, track.table, track.start_b + step)
+    xa, xb = seg_a.at(0)[0], seg_b.at(0)[0]
+    r_a, r_b = rotation_rpy(*xa[3:]), matmul(vessels.REST_B, rotation_rpy(*xb[3:]))
+    return (r_a, xa[:3]), (r_b, vadd(vessels.REST_B_M, (xb[0], xb[1], xb[2])))
+
+
+def _sample(env: V2VEnv, before: EnvState, after: EnvState, action: jax.Array) -> Poses:
+    del before, action
+    track = after.track
+    (r_a, p_a), (r_b, p_b) = vessel_poses(env.motion, track, after.step * SUBSTEPS)
+    a_rotation, a_m = jnp.asarray(r_a), jnp.stack(p_a)
+    return Poses(
+        a_m=a_m,
+        a_rotation=a_rotation,
+        b_m=jnp.stack(p_b),
+        b_rotation=jnp.asarray(r_b),
+        goal_m=a_m + a_rotation @ after.goal_position,
+        goal_rotation=a_rotation @ after.goal_rotation,
+        q_rad=after.arm.q,
+        pos_error_m=after.metrics.pos_error_m,
+        ang_error_rad=after.metrics.ang_error_rad,
+        seed=track.table % env.motion.seeds,
+        start_a=track.start_a,
+        start_b=track.start_b,
+    )

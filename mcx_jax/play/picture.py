@@ -1,0 +1,124 @@
+"""One picture of an episode: a panel for each controller, a close-up in it, the errors so far."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from mcx_jax.play.episode import Take
+from mcx_jax.play.stage import Painter, Stage
+from mcx_jax.play.waves import Surface
+
+WIDTH_PX, HEIGHT_PX = 1280, 720
+TITLE_PX, PANEL_PX, GAP_PX = 46, 430, 4
+CLOSE_UP_PX = 168
+PLOT_BOX_PX = (54, 508, 1256, 688)
+"""Left, top, right, bottom of the axes."""
+INK, MUTED, GRID, PAPER = "#1f2328", "#5f6670", "#e3e6ea", "#ffffff"
+COLOURS = ("#d1480b", "#0072b2")
+"""Of `ik` and of the other."""
+TICKS_MM = (0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200)
+"""Distances of grid lines to choose from."""
+
+
+class Picture:
+    """Draws the frames of one take."""
+
+    def __init__(self, take: Take, surface: Surface, stage: Stage, painter: Painter, title: str):
+        """
+        Args:
+            surface: at the instants of the frames.
+            title: the line at the top.
+        """
+        self._take, self._surface, self._stage, self._painter = take, surface, stage, painter
+        self._title = title
+        # Round numbers; a diverged episode must not flatten the rest.
+        highest = max(np.nanquantile(1e3 * p.pos_error_m, 0.995) for p in take.poses)
+        self._tick_mm = next((t for t in TICKS_MM if highest <= 4.5 * t), TICKS_MM[-1])
+        self._top_mm = 1.15 * highest
+
+    def frame(self, frame: int, step: int) -> np.ndarray:
+        """(720, 1280, 3) uint8.
+
+        Args:
+            frame: index into the surface's instants.
+            step: the same instant as a control step of the take.
+        """
+        image = Image.new("RGB", (WIDTH_PX, HEIGHT_PX), PAPER)
+        draw = ImageDraw.Draw(image)
+        draw.rectangle((0, 0, WIDTH_PX, TITLE_PX), fill=INK)
+        draw.text((16, TITLE_PX / 2), self._title, "white", font(21), anchor="lm")
+        clock = f"{self._take.time_s[step]:.1f} s"
+        draw.text((WIDTH_PX - 16, TITLE_PX / 2), clock, "white", font(21), anchor="rm")
+        self._stage.set_sea(self._surface, frame)
+        self._painter.upload_sea()
+        count = len(self._take.names)
+        width = (WIDTH_PX - GAP_PX * (count - 1)) // count
+        for i in range(count):
+            self._panel(image, i, step, i * (width + GAP_PX), width)
+        self._plot(draw, step)
+        return np.asarray(image)
+
+    def _panel(self, image: Image.Image, i: int, step: int, left: int, width: int) -> None:
+        poses = self._take.poses[i]
+        self._stage.place(poses, step)
+        camera = "hero" if len(self._take.names) == 1 else "pair"
+        wide = Image.fromarray(self._painter.wide(width, PANEL_PX, camera))
+        image.paste(wide, (left, TITLE_PX))
+        top = TITLE_PX + 10
+        inset(image, self._painter.close_up(CLOSE_UP_PX), left + width - 10, top)
+        draw = ImageDraw.Draw(image)
+        name = self._take.names[i]
+        label = "IK baseline" if name == "ik" else name
+        chip(draw, (left + 10, top), label, COLOURS[i], 22)
+        dp, da = 1e3 * poses.pos_error_m[step], 1e3 * poses.ang_error_rad[step]
+        chip(draw, (left + 10, top + 40), f"{dp:.2f} mm", INK, 20)
+        chip(draw, (left + 10, top + 78), f"{da:.2f} mrad", INK, 20)
+
+    def _plot(self, draw: ImageDraw.ImageDraw, step: int) -> None:
+        left, top, right, bottom = PLOT_BOX_PX
+        time_s = self._take.time_s
+        across = (right - left) / time_s[-1]
+        up = (bottom - top) / self._top_mm
+        for mm in np.arange(0, self._top_mm, self._tick_mm):
+            y = bottom - up * mm
+            draw.line((left, y, right, y), MUTED if mm == 0 else GRID, 1)
+            draw.text((left - 8, y), f"{mm:g}", INK, font(15), anchor="rm")
+        draw.text((14, top - 20), "position error, mm, over time, s", INK, font(15), anchor="lm")
+        every_s = max(1, round(time_s[-1] / 10))
+        for second in np.arange(0, time_s[-1] + 1e-9, every_s):
+            x = left + across * second
+            draw.text((x, bottom + 8), f"{second:g}", INK, font(15), anchor="mt")
+        for i, poses in enumerate(self._take.poses):
+            mm = np.nan_to_num(1e3 * poses.pos_error_m[: step + 1], nan=self._top_mm)
+            y = bottom - up * np.clip(mm, 0, self._top_mm)
+            line = list(zip(left + across * time_s[: step + 1], y, strict=True))
+            if len(line) > 1:
+                draw.line(line, COLOURS[i], 3, joint="curve")
+            x, y = line[-1]
+            draw.ellipse((x - 5, y - 5, x + 5, y + 5), fill=COLOURS[i])
+
+
+def inset(image: Image.Image, close_up: np.ndarray, right: int, top: int) -> None:
+    """Put a close-up (size, size, 3) with its caption into a picture, its right upper corner so."""
+    size = len(close_up)
+    frame = (right - size - 2, top - 2, right + 1, top + size + 22)
+    draw = ImageDraw.Draw(image)
+    draw.rounded_rectangle(frame, 4, fill="white")
+    image.paste(Image.fromarray(close_up), (right - size, top))
+    caption = right - size / 2, top + size + 10
+    draw.text(caption, "thick: goal   thin: tool", INK, font(14), anchor="mm")
+
+
+def chip(draw: ImageDraw.ImageDraw, corner: Sequence[float], text: str, colour: str, size: int):
+    """Text on a plate of white, its upper left corner at `corner` (pixels)."""
+    x, y = corner
+    box = draw.textbbox((x + 9, y + 6), text, font(size))
+    plate = (x, y, box[2] + 9, y + size + 14)
+    draw.rounded_rectangle(plate, 5, fill="white")
+    draw.text((x + 9, y + (size + 14) / 2), text, colour, font(size), anchor="lm")
+
+
+def font(size: int):
+    """Pillow's own letters: nothing to find on the machine."""
+    return ImageFont.load_default(size)

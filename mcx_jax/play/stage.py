@@ -1,0 +1,112 @@
+"""An episode put on the stage: the scene's model posed at an instant, and MuJoCo's pixels of it."""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from mcx_jax.assets import asset_path
+from mcx_jax.config import EnvConfig
+from mcx_jax.envs.model import ARMS
+from mcx_jax.play.episode import Poses
+from mcx_jax.play.waves import Surface
+from mcx_jax.scene import build_scene, pose_scene, sea_points_m, set_sea
+
+CLOSE_UP = (0.24, 75.0, 12.0)
+"""The close-up's camera about the goal: distance m, azimuth and elevation deg. From below, since
+the flange hides the tool's point from above."""
+FILM_QUALITY = (1024, 4)
+"""Shadow map's side, samples a pixel: without a GPU a picture takes 0.6 s instead of 3."""
+
+
+class Stage:
+    """The scene with one arm; `place` puts it where an episode says."""
+
+    def __init__(self, env: EnvConfig):
+        arm = asset_path(ARMS[env.arm]) if env.arm in ARMS else Path(env.arm)
+        self.model = build_scene(arm)
+        self.data = mujoco.MjData(self.model)
+        self.tool_site = env.tool_site
+        self._sea_points_m = sea_points_m(self.model)
+
+    def place(self, poses: Poses, step: int) -> None:
+        """Vessels, goal, arm and tool marker at the end of a control step, 0 = the first."""
+        pose_scene(
+            self.model,
+            self.data,
+            poses.q_rad[step],
+            self.tool_site,
+            vessel_a=(poses.a_m[step], quaternion(poses.a_rotation[step])),
+            vessel_b=(poses.b_m[step], quaternion(poses.b_rotation[step])),
+            goal=(poses.goal_m[step], quaternion(poses.goal_rotation[step])),
+        )
+
+    def set_sea(self, surface: Surface, frame: int) -> None:
+        """The sea at one of the surface's instants."""
+        set_sea(self.model, surface.elevation_m(frame, *self._sea_points_m))
+
+
+def quaternion(rotation: np.ndarray) -> np.ndarray:
+    """(4,) wxyz of a rotation matrix (3, 3)."""
+    wxyz = np.zeros(4)
+    mujoco.mju_mat2Quat(wxyz, np.asarray(rotation, float).ravel())
+    return wxyz
+
+
+class Painter:
+    """Pixels of a stage; needs `gl.choose()` before MuJoCo's first import. Use as a context."""
+
+    def __init__(self, stage: Stage, width_px: int, height_px: int, *, fine: bool = False):
+        """Args: the largest picture that will be asked for; fine = the scene file's quality."""
+        model = stage.model
+        if not fine:
+            model.vis.quality.shadowsize, model.vis.quality.offsamples = FILM_QUALITY
+        model.vis.global_.offwidth, model.vis.global_.offheight = width_px, height_px
+        self._stage = stage
+        self._gl = mujoco.GLContext(width_px, height_px)
+        self._gl.make_current()
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        self._scene = mujoco.MjvScene(model, maxgeom=1000)
+        self._option = mujoco.MjvOption()
+
+    def __enter__(self) -> "Painter":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self._context.free()
+        self._gl.free()
+
+    def upload_sea(self) -> None:
+        """Tell the renderer that the stage's sea has changed."""
+        mujoco.mjr_uploadHField(
+            self._stage.model, self._context, self._stage.model.hfield("sea").id
+        )
+
+    def wide(self, width_px: int, height_px: int, camera: str) -> np.ndarray:
+        """(height, width, 3) uint8 through one of the scene's cameras."""
+        view = mujoco.MjvCamera()
+        view.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        view.fixedcamid = self._stage.model.camera(camera).id
+        return self._draw(view, width_px, height_px)
+
+    def close_up(self, size_px: int) -> np.ndarray:
+        """(size, size, 3) uint8: the goal in the middle."""
+        view = mujoco.MjvCamera()
+        view.lookat = self._stage.data.body("goal").xpos
+        view.distance, view.azimuth, view.elevation = CLOSE_UP
+        # The arm's own shadow covers most of it, and a shadow costs as much again as the rest.
+        return self._draw(view, size_px, size_px, shadow=False)
+
+    def _draw(
+        self, view: mujoco.MjvCamera, width_px: int, height_px: int, *, shadow: bool = True
+    ) -> np.ndarray:
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = shadow
+        every = mujoco.mjtCatBit.mjCAT_ALL.value
+        model, data = self._stage.model, self._stage.data
+        mujoco.mjv_updateScene(model, data, self._option, None, view, every, self._scene)
+        rect = mujoco.MjrRect(0, 0, width_px, height_px)
+        pixels = np.empty((height_px, width_px, 3), np.uint8)
+        mujoco.mjr_render(rect, self._scene, self._context)
+        mujoco.mjr_readPixels(pixels, None, rect, self._context)
+        return pixels[::-1]

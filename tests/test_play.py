@@ -1,0 +1,303 @@
+"""Play: what is drawn is what was simulated, the page serves, a film has its frames."""
+
+import contextlib
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+import urllib.request
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mcx_jax.config import SUBSTEPS, EnvConfig, MotionConfig
+from mcx_jax.controllers import CLASSICAL
+from mcx_jax.envs import ik, vessels
+from mcx_jax.envs.motion import Track
+from mcx_jax.envs.v2v import make_env
+from mcx_jax.errors import UserError
+from mcx_jax.evaluate import errors_beside_ik
+from mcx_jax.play import gl
+from mcx_jax.play.__main__ import PlayConfig, main
+from mcx_jax.play.episode import EPISODES, simulate
+from mcx_jax.play.stage import Stage
+from mcx_jax.play.waves import surface
+from mcx_jax.sea.hydro import VesselKnobs
+from mcx_jax.sea.spectrum import GRAVITY_M_S2, parse_sea
+from mcx_jax.sea.tables import component_grid, inverse_fft, table_seed, wave_amplitudes
+from mcx_jax.spatial import unpack
+
+STEPS, EPISODE, SEED = 60, 2, 4
+# The quiet integrator, so that rounding stays rounding.
+TASK = EnvConfig(delay="E1", integrator="implicitfast", episode_steps=STEPS)
+MOTION = MotionConfig(sea="Wd")
+
+
+@pytest.fixture(scope="module")
+def env():
+    return make_env(TASK, MOTION, split="test")
+
+
+@pytest.fixture(scope="module")
+def take(env):
+    return simulate(env, "extrapolate", CLASSICAL["extrapolate"], sea=0, seed=SEED, episode=EPISODE)
+
+
+def test_an_episode_is_evaluates(env, take):
+    both = errors_beside_ik(
+        "extrapolate", CLASSICAL["extrapolate"], env, episodes=EPISODES, seed=SEED
+    )
+    assert take.names == ("ik", "extrapolate") and take.sea == "Wd" and take.delay == "E1"
+    for errors, poses in zip(both, take.poses, strict=True):
+        np.testing.assert_allclose(poses.pos_error_m, errors.pos_m[:, 0, EPISODE], atol=2e-5)
+        np.testing.assert_allclose(poses.ang_error_rad, errors.ang_rad[:, 0, EPISODE], atol=2e-5)
+
+
+@pytest.mark.parametrize("step", [0, 31, STEPS - 1])
+def test_drawn_is_simulated(env, take, step):
+    """Tool and goal on the stage, seen from the drawn arm's base, against the environment's."""
+    stage = Stage(TASK)
+    for poses in take.poses:
+        stage.place(poses, step)
+        data = stage.data
+        base = data.body("arm/base")
+        to_base = base.xmat.reshape(3, 3).T
+
+        def seen(rotation, position_m, to_base=to_base, base=base):
+            return to_base @ rotation.reshape(3, 3), to_base @ (position_m - base.xpos)
+
+        tool = seen(data.site("arm/tool").xmat, data.site("arm/tool").xpos)
+        goal = seen(data.body("goal").xmat, data.body("goal").xpos)
+        marker = seen(data.body("tool").xmat, data.body("tool").xpos)
+        track = Track(*(jnp.int32(x[0]) for x in (poses.seed, poses.start_a, poses.start_b)))
+        # The goal's place on vessel B, from the drawn vessel; then all by the environment's code.
+        deck = data.body("vessel_b")
+        goal_m = deck.xmat.reshape(3, 3).T @ (data.body("goal").xpos - deck.xpos)
+        wanted_goal = vessels.goal_pose(
+            env.motion, track, jnp.asarray(goal_m, jnp.float32), jnp.int32(SUBSTEPS * (step + 1))
+        )
+        wanted_tool = ik.tool_pose(env.model, unpack(jnp.asarray(poses.q_rad[step]), 6))
+        for drawn, wanted in ((tool, wanted_tool), (marker, wanted_tool), (goal, wanted_goal)):
+            np.testing.assert_allclose(drawn[0], np.array(wanted[0]), atol=1e-5)
+            np.testing.assert_allclose(drawn[1], np.array(wanted[1]), atol=1e-5)
+        assert np.all(goal_m > np.array(vessels.GOAL_LOW_M) - 1e-5)
+        assert np.all(goal_m < np.array(vessels.GOAL_HIGH_M) + 1e-5)
+        apart_m = np.linalg.norm(tool[1] - goal[1])
+        assert apart_m == pytest.approx(poses.pos_error_m[step], abs=1e-5)
+
+
+def test_surface_is_the_motions_waves(take):
+    """At a knot and at a place off midship: the tables' own inverse FFT of the shifted waves."""
+    knobs = VesselKnobs()
+    start_s = take.window_starts_s[0]
+    knot = math.ceil(10 * start_s)
+    made = surface(take, MotionConfig(sea="Wd", coupled=True), np.array([knot / 10 - start_s]))
+    sea = parse_sea("Wd")
+    waves = wave_amplitudes(sea, table_seed(sea, "test", 0), knobs)
+    omega = component_grid()[1]
+    heading = math.radians(knobs.heading_deg)
+    for x_m, y_m in ((0.4, 0.0), (-0.9, 0.3), (1.8, -2.0)):
+        # Full scale; the deck origin is 4 m aft of midship.
+        full_m = math.cos(heading) * (10 * x_m - 4) + math.sin(heading) * 10 * y_m
+        elevation = inverse_fft(waves * np.exp(1j * omega**2 / GRAVITY_M_S2 * full_m))[0] / 10
+        drawn = made.elevation_m(0, np.array([x_m]), np.array([y_m]))
+        # Linear interpolation over 6 cm.
+        assert drawn[0] == pytest.approx(elevation[knot], abs=2e-3)
+
+
+@pytest.mark.parametrize("coupled", [False, True])
+def test_vessels_ride_the_waves_that_are_drawn(coupled):
+    """In long waves the deck's heave follows the surface below it, not another place or time."""
+    motion = MotionConfig(sea="Wd", coupled=coupled)
+    env = make_env(EnvConfig(episode_steps=1000), motion, split="test")
+    from mcx_jax.play.episode import Poses, Take, vessel_poses
+
+    starts = jnp.int32(70_000), jnp.int32(70_000 if coupled else 1_100_000)
+    track = Track(jnp.int32(0), *starts)
+    steps = SUBSTEPS * jnp.arange(1, 1001)
+    (_, p_a), (_, p_b) = jax.vmap(lambda step: vessel_poses(env.motion, track, step))(steps)
+    fill = dict.fromkeys(Poses.__dataclass_fields__)
+    seed, *windows = (np.full(1000, x) for x in (0, *map(int, starts)))
+    fill |= {"seed": seed, "start_a": windows[0], "start_b": windows[1], "pos_error_m": seed}
+    take = Take(("ik",), (Poses(**fill),), "E1", "Wd")
+    made = surface(take, motion, take.time_s)
+    # At the deck origins the surface is each vessel's own.
+    for heave_m, x_m in ((p_a[2], 0.0), (p_b[2], 0.65)):
+        at = np.array([x_m]), np.array([0.0])
+        elevation_m = np.array([made.elevation_m(i, *at)[0] for i in range(1000)])
+        assert np.corrcoef(np.asarray(heave_m), elevation_m)[0, 1] > 0.85
+    assert made.profiles_m.std() == pytest.approx(0.25 / 4, rel=0.2)
+
+
+def test_calm_water_for_a_recording(take):
+    made = surface(take, MotionConfig(motion="log.csv"), take.time_s)
+    assert not made.profiles_m.any() and "calm" in made.note
+
+
+def refused(argv, message):
+    with pytest.raises(UserError) as error:
+        main(argv)
+    assert str(error.value) == message
+
+
+def test_refusals(tmp_path, monkeypatch):
+    refused(["nobody"], "unknown controller 'nobody': use ik, extrapolate, preview, a run "
+            "directory or a policy .npz")  # fmt: skip
+    wrong = [
+        (["--video", "a.avi"], "--video a.avi: the file's name must end in .mp4"),
+        (["--frame", "a.jpg"], "--frame a.jpg: the file's name must end in .png"),
+        (["--video", f"{tmp_path}/no/a.mp4"], f"--video {tmp_path}/no/a.mp4: no such directory"),
+        (["--video", "a.mp4", "--frame", "a.png"], "--video and --frame: one at a time"),
+        (["--frame", "a.png", "--at", "21"], "--at 21: the episode is 20 s long; 0 to 20"),
+        (["--port", "0"], "--port 0: must be 1 to 65535"),
+        (["--episode", "50"], "--episode 50: must be 0 to 49"),
+        (["--seed", "-1"], "--seed -1: must be 0 or a positive integer"),
+    ]
+    for argv, message in wrong:
+        refused(["ik", *argv], message)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    refused(["ik"], "play needs viser: pip install 'mcx_jax[viz]'")
+    refused(["ik", "--frame", "a.png"], "play needs pillow: pip install 'mcx_jax[viz]'")
+
+
+def test_no_opengl_is_one_line(monkeypatch):
+    monkeypatch.setattr(gl, "_TRY", "raise SystemExit(1)")
+    monkeypatch.setenv("MUJOCO_GL", "disable")
+    with pytest.raises(UserError, match=r"^no off-screen OpenGL .* libosmesa6 .* libegl1 "):
+        gl.choose()
+
+
+def command(*argv):
+    """A process as a user starts it: the suite itself must not touch OpenGL."""
+    environment = {k: v for k, v in os.environ.items() if k != "MUJOCO_GL"}
+    return [sys.executable, "-m", "mcx_jax.play", *argv], environment
+
+
+def test_film_has_its_frames_and_something_in_them(tmp_path, repo_root):
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="films need the extra viz")
+    path = tmp_path / "film.mp4"
+    argv, environment = command("extrapolate", "--video", str(path), "--episode-steps", "12")
+    done = subprocess.run(
+        argv, env=environment, cwd=repo_root, capture_output=True, text=True, check=False
+    )
+    if "no off-screen OpenGL" in done.stderr:
+        pytest.skip(done.stderr.strip())
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert done.stdout.endswith(f"done: {path}, 6 frames, 25 a second\n")
+    assert [x.name for x in tmp_path.iterdir()] == ["film.mp4"]
+    read = [ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-i", str(path)]
+    read += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    raw = subprocess.run(read, capture_output=True, check=True).stdout
+    frames = np.frombuffer(raw, np.uint8).reshape(6, 720, 1280, 3)
+    for frame in frames:
+        left, right = frame[50:470, :630], frame[50:470, 650:]
+        assert left.std() > 20 and right.std() > 20
+    # The clock, the sea and the curves move.
+    assert np.abs(frames[5].astype(int) - frames[0]).mean() > 0.5
+
+
+@pytest.fixture(scope="module")
+def player():
+    pytest.importorskip("viser", reason="the page needs the extra viz")
+    from mcx_jax.play.player import Player
+    from mcx_jax.report.entries import load_entries
+
+    config = PlayConfig(who="extrapolate", port=18080, env=TASK, motion=MotionConfig())
+    player = Player(config, *load_entries(["extrapolate"]))
+    yield player
+    player.stop()
+
+
+def test_page_answers_and_builds_the_scene(player):
+    with urllib.request.urlopen(player.url, timeout=20) as answer:
+        assert answer.status == 200 and b"<html" in answer.read()[:2000].lower()
+    player.prepare(player.wanted)
+    player.show(STEPS // 2 - 1)
+    step = STEPS - 2
+    assert player.take.sea == "Wd"
+    for poses, tableau in zip(player.take.poses, player.tableaux, strict=True):
+        frames = {player.stage.model.body(k).name: v for k, v in tableau._frames.items()}
+        np.testing.assert_allclose(frames["vessel_b"].position, poses.b_m[step], atol=1e-6)
+        np.testing.assert_allclose(frames["goal"].position, poses.goal_m[step], atol=1e-6)
+        apart_m = np.linalg.norm(np.subtract(frames["tool"].position, frames["goal"].position))
+        assert apart_m == pytest.approx(poses.pos_error_m[step], abs=1e-5)
+    assert "own window" in player._note.content
+    assert len(player._plot.data) == 3
+
+
+def test_every_drawn_geom_is_in_the_page(player):
+    """The browser's meshes are where MuJoCo has its geoms: their middles and extents agree."""
+    from mcx_jax.play.page import _shape
+
+    model = player.stage.model
+    for geom in range(model.ngeom):
+        if model.geom(geom).name == "sea" or model.geom_group[geom] > 2:
+            continue
+        shape = _shape(model, geom)
+        middle = shape.bounds.mean(axis=0)
+        np.testing.assert_allclose(middle, model.geom_pos[geom], atol=2e-3)
+        radius = np.linalg.norm(shape.vertices - model.geom_pos[geom], axis=1).max()
+        assert radius <= model.geom_rbound[geom] * 1.001 + 1e-6
+        assert radius >= model.geom_rbound[geom] * 0.70
+
+
+def test_the_loop_follows_a_new_choice_and_stops(player):
+    import dataclasses
+
+    wanted = dataclasses.replace(player.wanted, who="ik", sea="Wa", episode=3)
+    player.wanted = wanted
+    rounds = iter(range(4))
+    player.run(lambda: next(rounds, None) is None)
+    assert player.take.names == ("ik",) and player.take.sea == "Wa"
+    assert not player.tableaux[1].root.visible
+    assert "episode 3" in player._said.content
+
+
+def test_ctrl_c_ends_cleanly(repo_root):
+    pytest.importorskip("viser", reason="the page needs the extra viz")
+    argv, environment = command("ik", "--port", "18181", "--episode-steps", "60")
+    with subprocess.Popen(
+        argv,
+        env=environment,
+        cwd=repo_root,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        watchdog = threading.Timer(300, process.kill)
+        watchdog.start()
+        assert process.stdout and process.stderr
+        said = ""
+        with contextlib.suppress(StopIteration):
+            while "open http://127.0.0.1:" not in said:
+                said += next(process.stdout)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate()
+        watchdog.cancel()
+    assert process.returncode == 0, err
+    assert (out, err) == ("\nstopped\n", "")
+    assert "viser" not in said
+
+
+def test_sea_of_the_model_is_the_surface(take):
+    from mcx_jax.scene import sea_points_m, water_level_m
+
+    stage = Stage(TASK)
+    made = surface(take, MOTION, take.time_s[:1])
+    stage.set_sea(made, 0)
+    model, field = stage.model, stage.model.hfield("sea")
+    x_m, y_m = sea_points_m(model)
+    row, column = 100, 37
+    # MuJoCo's own reading of a height field: centre, half sizes, data times the range.
+    height_m = model.geom("sea").pos[2] + field.size[2] * field.data[row, column]
+    wanted_m = made.elevation_m(0, x_m[row, column], y_m[row, column])
+    assert height_m - water_level_m(model) == pytest.approx(float(wanted_m), abs=1e-6)
+    assert x_m[0, 0] < x_m[0, -1] and y_m[0, 0] < y_m[-1, 0]
+    assert water_level_m(model) == pytest.approx(-0.21)
+    assert model.geom_type[model.geom("sea").id] == mujoco.mjtGeom.mjGEOM_HFIELD
