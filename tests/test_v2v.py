@@ -406,7 +406,7 @@ def test_gradient_of_the_reward_by_the_action(env, first):
     # The first step of an episode starts settled: with corrections of 0.1 mm no servo saturates
     # (the weakest: 56 N m / 1e5 N m/rad = 0.56 mrad). No delay, or the reward would not answer.
     with jax.enable_x64(True):
-        env64 = in_float64(env.replace(config=dataclasses.replace(env.config, delay="E0")))
+        env64 = in_float64(env.with_delay("E0"))
         state = in_float64(first)
         state = state.replace(lag=lag.init_all(env64.delays, state.reference))
 

@@ -107,6 +107,11 @@ class V2VEnv:
         """An episode has one of them."""
         return self.config.delays
 
+    def with_delay(self, delay: str) -> "V2VEnv":
+        """The same task with another `--delay`, and controllers that are told it."""
+        config = replace(self.config, delay=delay)
+        return replace(self, config=config, known_delay=config.delays[0])
+
     @property
     def episode_steps(self) -> int:
         """Control steps of an episode."""

@@ -69,6 +69,7 @@ class PlayConfig:
 def main(argv: list[str] | None = None) -> None:
     """Command line."""
     from mcx_jax import cli, startup
+    from mcx_jax.evaluate import fit_if_needed
     from mcx_jax.report import entries
 
     argv = list(sys.argv[1:] if argv is None else argv)
@@ -88,7 +89,9 @@ def main(argv: list[str] | None = None) -> None:
     # Again, with the policy's own task as the defaults.
     who = PlayConfig(who=config.who, env=own)
     config = cli.parse(PlayConfig, argv, prog="play", default=who)
-    print(config.env.parsed_delay.describe(), flush=True)
+    print(config.env.describe_delays(), flush=True)
+    fitted = fit_if_needed(entry.who, entry.controller, config.env, config.motion, "")
+    entry = dataclasses.replace(entry, controller=fitted)
     try:
         if config.to_file:
             to_file(config, entry)

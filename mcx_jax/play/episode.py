@@ -93,7 +93,7 @@ def simulate(
     key = jax.random.split(jax.random.key(seed), EPISODES)[episode]
     both = side_by_side(env, controller, key, sea, _sample)
     names = ("ik",) if who == "ik" else ("ik", who)
-    return Take(names, both[: len(names)], env.delay.name, env.motion.seas[sea])
+    return Take(names, both[: len(names)], env.config.delay, env.motion.seas[sea])
 
 
 def vessel_poses(motion: Motion, track: Track, step: jax.Array):
@@ -110,13 +110,14 @@ def _sample(env: V2VEnv, before: EnvState, after: EnvState, action: jax.Array) -
     track = after.track
     (r_a, p_a), (r_b, p_b) = vessel_poses(env.motion, track, after.step * SUBSTEPS)
     a_rotation, a_m = jnp.asarray(r_a), jnp.stack(p_a)
+    goal = env.goal_ahead(after, 0)
     return Poses(
         a_m=a_m,
         a_rotation=a_rotation,
         b_m=jnp.stack(p_b),
         b_rotation=jnp.asarray(r_b),
-        goal_m=a_m + a_rotation @ after.goal_position,
-        goal_rotation=a_rotation @ after.goal_rotation,
+        goal_m=a_m + a_rotation @ jnp.stack(goal[1]),
+        goal_rotation=a_rotation @ jnp.asarray(goal[0]),
         q_rad=after.arm.q,
         pos_error_m=after.metrics.pos_error_m,
         ang_error_rad=after.metrics.ang_error_rad,

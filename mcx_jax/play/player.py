@@ -143,7 +143,7 @@ class Player:
             control.disabled = True
         self.server.flush()
         delay = parse_delay(choice.delay)
-        env = self.env.replace(delay=delay)  # type: ignore[attr-defined]
+        env = self.env.with_delay(choice.delay)
         take = simulate(
             env,
             choice.who,

@@ -106,6 +106,6 @@ def _picture(
     """The pictures of these control steps; the renderer is given back at the end."""
     stage = Stage(env)
     water = surface(take, motion, take.time_s[steps])
-    line = title(take, 1e3 * env.parsed_delay.group_delay_s)
+    line = title(take, 1e3 * env.delays[0].group_delay_s)
     with Painter(stage, WIDTH_PX, HEIGHT_PX, fine=fine) as painter:
         yield Picture(take, water, stage, painter, line)
