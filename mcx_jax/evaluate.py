@@ -48,7 +48,7 @@ class EvaluateConfig:
             parse_delay(self.known_delay)
 
 
-def run_episodes(env, controller, keys, seas, gain):
+def run_episodes(env, controller, keys, seas, gain, given=None):
     """Whole episodes, batch axis last inside.
 
     Args:
@@ -58,6 +58,7 @@ def run_episodes(env, controller, keys, seas, gain):
         seas: (N,) int32 sea index per episode.
         gain: (N,) factor of the controller's actions: 0 makes an episode one of the IK baseline, so
             that baseline and controller share one program (compiling takes ten times the run).
+        given: conditions in place of those that the episodes draw, leaves (..., N).
 
     Returns:
         dp (steps, N) m, da (steps, N) rad, valid (N,) bool, correction (steps, 6, N) in cm and
@@ -68,10 +69,10 @@ def run_episodes(env, controller, keys, seas, gain):
 
     from mcx_jax.envs.model import torque_limits_nm
 
-    reset = jax.vmap(lambda k, s: env.reset(k, s), in_axes=0, out_axes=-1)
+    reset = jax.vmap(env.reset, in_axes=(0, 0, None if given is None else -1), out_axes=-1)
     step = jax.vmap(env.step, in_axes=-1, out_axes=-1)
     act = jax.vmap(functools.partial(controller.act, env), in_axes=-1, out_axes=-1)
-    state = reset(keys, seas)
+    state = reset(keys, seas, given)
     memory = jax.vmap(functools.partial(controller.init, env), in_axes=-1, out_axes=-1)(state)
 
     def body(carry, _):

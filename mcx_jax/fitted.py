@@ -6,6 +6,7 @@ policy sees of the goal, are told the delay and the age of measurements, and are
 conditions they are evaluated under: they know more than a policy that was trained for many.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -42,7 +43,8 @@ class Fir:
     """The goal's pose ahead as a linear function of how it got where it is."""
 
     weights: jax.Array
-    """(6 (TAPS - 1), 6): from the changes of pose (m, rad, in B) to the change still to come."""
+    """(ages, 6 (TAPS - 1), 6): from the changes of pose (m, rad, in B) to the change still to come,
+    for every age of the measurement in control steps that the task knows."""
 
     def init(self, env: V2VEnv, state: EnvState) -> jax.Array:
         """(TAPS, 12) poses: the present one, as if the goal had always been there."""
@@ -51,7 +53,9 @@ class Fir:
     def act(self, env: V2VEnv, state: EnvState, memory: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Move the goal to where it is predicted."""
         memory = jnp.concatenate([memory[1:], _flat(state.measured)[None]])
-        change = unpack(features(memory) @ self.weights, 6)
+        latency = state.conditions.latency
+        weights = self.weights[0] if latency is None else self.weights[latency]
+        change = unpack(features(memory) @ weights, 6)
         r, p = state.measured.pose
         ahead = matmul(exp_rotation(change[3:]), r), vadd(p, change[:3])  # type: ignore[arg-type]
         return memory, correction((r, p), ahead)
@@ -78,19 +82,29 @@ def fit_fir(env: V2VEnv, lead_s: float) -> Fir:
         env: on training motion; its conditions are those of the fit.
         lead_s: how far ahead of the present, not of a late measurement, to predict.
     """
+    oldest = int(env.config.conditions.ranges["latency_steps"].high)
+    lead = round(lead_s / PHYSICS_DT_S)
+    return Fir(jnp.stack([_weights(env, lead, age) for age in range(oldest + 1)]))
+
+
+def _weights(env: V2VEnv, lead: int, age: int) -> jax.Array:
+    """Least squares for measurements of one age."""
     keys = jax.random.split(jax.random.key(FIT_SEED), FIT_EPISODES)
-    x, y = jax.device_get(_regression(env, keys, jnp.int32(round(lead_s / PHYSICS_DT_S))))
+    x, y = jax.device_get(_regression(env, keys, jnp.int32(lead), jnp.int32(age)))
     x, y = (a.reshape(-1, a.shape[-1]).astype(np.float64) for a in (x, y))
     normal = x.T @ x + RIDGE * len(x) * np.eye(x.shape[1])
-    return Fir(jnp.asarray(np.linalg.solve(normal, x.T @ y), jnp.float32))
+    return jnp.asarray(np.linalg.solve(normal, x.T @ y), jnp.float32)
 
 
 @jax.jit
-def _regression(env: V2VEnv, keys: jax.Array, lead: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _regression(
+    env: V2VEnv, keys: jax.Array, lead: jax.Array, age: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """(episodes, steps, features), (episodes, steps, 6): what the filter sees and what it wants."""
 
     def episode(key):
         track, goal_m, drawn = env.draw(key)
+        drawn = drawn if drawn.latency is None else replace(drawn, latency=age)
         goal = lambda step: env.goal_at(track, goal_m, drawn, step)  # noqa: E731
         first = conditions.first_measurement(drawn, env.config, goal(jnp.int32(0)))
 

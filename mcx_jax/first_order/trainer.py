@@ -122,6 +122,7 @@ def window_gradient(params, config: TrainConfig, env: Any, stats: RunningStats, 
         steps = config.first_order.horizon_steps
         after, (obs, metrics) = jax.lax.scan(one_step, actors, None, steps)
         error = metrics.pos_error_m + metrics.ang_error_rad
+        error = error + error**2 / (2e-3 * config.first_order.tail_mm)
         # where, not a product: a NaN times zero is NaN.
         kept = jnp.where(metrics.valid, error, 0.0)
         loss = jnp.sum(kept) / jnp.maximum(jnp.sum(metrics.valid), 1)

@@ -1,0 +1,143 @@
+"""Controllers where the task is hard: noise, age of measurements, other delays, arms, loads, seas.
+
+    python experiments/robust.py RUN...
+
+RUN are trained policies (directories or .npz), all for delay B4_4. Every condition is measured on
+the same windows of motion and goals, 24 episodes in each of the four seas; one compiled program per
+controller runs all conditions. `extrapolate` and `fir` believe in B4_4 throughout and know the age
+of measurements; `fir-nominal` is fitted without disturbances, `fir` under the conditions that the
+robust policy was trained for. Writes experiments/robust.csv.
+"""
+
+import sys
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from record import provenance, write_rows
+
+from mcx_jax import startup
+from mcx_jax.config import ConditionsConfig, EnvConfig, MotionConfig
+from mcx_jax.controllers import CLASSICAL
+from mcx_jax.envs.conditions import Conditions, Noise
+from mcx_jax.envs.plant import Plant
+from mcx_jax.envs.v2v import make_env
+from mcx_jax.evaluate import load_controller, run_episodes
+from mcx_jax.fitted import fitted
+from mcx_jax.results import WARM_UP_STEPS
+from mcx_jax.sharding import env_mesh, put
+
+DELAYS = ("B4_4", "E1", "E2", "butter:4:8Hz")
+EPISODES, SEED = 24, 0
+ANY = ConditionsConfig("0:3", "0:3", "0:3", "0:5", "0.02:1")
+"""Every condition below is in these bounds; it makes all of them inputs of one program."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A condition; what is not said is the paper's world."""
+
+    name: str
+    noise_mm: float = 0.0
+    noise_mrad: float = 0.0
+    latency_steps: int = 0
+    delay: str = "B4_4"
+    payload_kg: float = 0.0
+    wrist_inertia: float = 1.0
+    implicit: float = 0.0
+    sea: str = ""
+    """"" = the four of the paper."""
+    coupled: bool = False
+
+
+ROWS = (
+    Row("as trained by the paper"),
+    *(Row(f"noise {x:g} mm", noise_mm=x) for x in (0.3, 1, 3)),
+    *(Row(f"noise {x:g} mrad", noise_mrad=x) for x in (1, 3)),
+    Row("noise 3 mm, 3 mrad", noise_mm=3, noise_mrad=3),
+    *(Row(f"measured {k} steps late", latency_steps=k) for k in (1, 2, 3)),
+    *(Row(f"delay {name}", delay=name) for name in DELAYS[1:]),
+    *(Row(f"payload {x:g} kg", payload_kg=x) for x in (1, 2, 5)),
+    *(Row(f"wrist inertia x {x:g}", wrist_inertia=x) for x in (0.1, 0.02)),
+    Row("integrator implicitfast", implicit=1.0),
+    Row("sea 3.0:11", sea="3.0:11"),
+    Row("coupled sea", coupled=True),
+)
+
+
+def conditions_of(rows: list[Row], keys: jax.Array) -> Conditions:
+    """One per row; leaves (rows,)."""
+    column = lambda name: jnp.asarray([getattr(r, name) for r in rows], jnp.float32)  # noqa: E731
+    return Conditions(
+        plant=Plant(column("payload_kg"), column("wrist_inertia"), column("implicit")),
+        noise=Noise(1e-3 * column("noise_mm"), 1e-3 * column("noise_mrad"), keys),
+        latency=column("latency_steps").astype(jnp.int32),
+        delay=jnp.asarray([DELAYS.index(r.delay) for r in rows], jnp.int32),
+        path_start=None,
+    )
+
+
+def task(sea: str, coupled: bool, split: str, conditions: ConditionsConfig = ANY):
+    config = EnvConfig(delay=",".join(DELAYS), integrator="mixed", conditions=conditions)
+    return make_env(config, MotionConfig(sea=sea, coupled=coupled), split=split)
+
+
+def measure(env, controller, gain: float, rows: list[Row]) -> list[dict]:
+    """Mean errors of a controller under each condition, all of one environment."""
+    seas = len(env.motion.seas)
+    episodes = seas * EPISODES
+    keys = jnp.tile(jax.random.split(jax.random.key(SEED), EPISODES), len(rows) * seas)
+    sea = jnp.tile(jnp.repeat(jnp.arange(seas), EPISODES), len(rows))
+    every = [row for row in rows for _ in range(episodes)]
+    given = conditions_of(every, jax.random.split(jax.random.key(SEED + 1), len(every)))
+    mesh = env_mesh(len(every))
+    env, controller = put(mesh, (env, controller))
+    arrays = put(mesh, (keys, sea, jnp.full(len(every), gain)), 0)
+    with jax.set_mesh(mesh):
+        dp, da, valid, *_ = jax.device_get(run(env, controller, *arrays, put(mesh, given, -1)))
+    shape = (-1, len(rows), episodes)
+    dp, da = dp[WARM_UP_STEPS:].reshape(shape), da[WARM_UP_STEPS:].reshape(shape)
+    return [
+        {
+            "condition": row.name,
+            "pos_mm": f"{1e3 * np.mean(dp[:, i]):.3f}",
+            "ang_mrad": f"{1e3 * np.mean(da[:, i]):.3f}",
+            "invalid": int((~valid.reshape(shape[1:])[i]).sum()),
+            "episodes": episodes,
+        }
+        for i, row in enumerate(rows)
+    ]
+
+
+run = jax.jit(run_episodes)
+
+
+def main() -> None:
+    startup.configure()
+    train = task("all", False, "train")
+    nominal = replace(train.config, delay="B4_4", conditions=ConditionsConfig(), integrator="euler")
+    plain = replace(train, config=nominal, integrator="euler")
+    controllers = {
+        "ik": (CLASSICAL["ik"], 0.0),
+        "extrapolate": (CLASSICAL["extrapolate"], 1.0),
+        "extrapolate-best": (fitted("extrapolate-best", plain), 1.0),
+        "fir": (fitted("fir", train), 1.0),
+    }
+    for who in sys.argv[1:]:
+        controllers[Path(who).name.removesuffix(".npz")] = (load_controller(who)[1], 1.0)
+    found = []
+    for who, (controller, gain) in controllers.items():
+        begun = time.monotonic()
+        for sea, coupled in (("all", False), ("3.0:11", False), ("all", True)):
+            rows = [r for r in ROWS if (r.sea or "all", r.coupled) == (sea, coupled)]
+            measured = measure(task(sea, coupled, "test"), controller, gain, rows)
+            found += [{"who": who, **row} for row in measured]
+        print(f"{who}: {time.monotonic() - begun:.0f} s", flush=True)
+    write_rows("robust", [{**row, **provenance()} for row in found])
+
+
+if __name__ == "__main__":
+    main()
