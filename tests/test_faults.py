@@ -14,7 +14,7 @@ from test_first_order import CONFIG as FIRST_ORDER
 from test_ppo_trainer import CONFIG as PPO
 
 from mcx_jax import checkpoint, divergence
-from mcx_jax.config import TrainConfig
+from mcx_jax.config import EnvConfig, TrainConfig
 from mcx_jax.errors import UserError
 from mcx_jax.ppo.rollout import replace_broken
 from mcx_jax.programs import Training, prepare
@@ -22,7 +22,10 @@ from mcx_jax.run_dir import open_existing, open_new
 from mcx_jax.sharding import env_mesh
 from mcx_jax.train import train
 
+# Two blocks of environments in both: environment 5 is not the one renewed first.
+FIRST_ORDER = replace(FIRST_ORDER, env=EnvConfig(episode_steps=32))
 CONFIGS = {"ppo": PPO, "first-order": FIRST_ORDER}
+BROKEN = 5
 
 
 @struct.dataclass
@@ -99,20 +102,37 @@ def test_nothing_is_reset_without_a_fault(algo):
 
 @pytest.mark.parametrize("algo", CONFIGS)
 def test_a_broken_environment_is_reset_and_reaches_nobody(algo):
-    """NaN in one environment's state: after the next reset all is finite, and in PPO the run is bit
-    for bit that in which the environment was replaced by hand."""
+    """NaN in one environment's state: bit for bit the run in which somebody had put the fresh
+    environment there by hand."""
+    config, training = CONFIGS[algo], _training(algo)
 
     def plant(state):
         env_state = state.actors.env_state
-        queue = env_state.queue.at[1, 5].set(jnp.nan)
+        queue = env_state.queue.at[1, BROKEN].set(jnp.nan)
         actors = replace(state.actors, env_state=env_state.replace(queue=queue))
         return state.replace(actors=actors)
 
+    def by_hand(state):
+        per_shard = config.num_envs // config.shards
+        shard, place = divmod(BROKEN, per_shard)
+        size = config.block_envs // config.shards
+        fresh = training._fresh(config.reset_groups)
+        env_state = jax.tree.map(
+            lambda old, new: old.at[..., BROKEN].set(new[..., shard * size + place % size]),
+            state.actors.env_state,
+            fresh,
+        )
+        return state.replace(actors=replace(state.actors, env_state=env_state))
+
     state, rows = _run(algo, 2, plant=plant)
     assert [row["reset_envs"] for row in rows] == [1.0, 0.0]
-    assert all(np.isfinite(list(row.values())).all() for row in rows)
     _assert_finite(state)
-    assert all(np.isfinite(x).all() for x in checkpoint.flatten(state.actors).values())
+    other, other_rows = _run(algo, 2, plant=by_hand)
+    assert other_rows[0].pop("reset_envs") == 0.0 and rows[0].pop("reset_envs") == 1.0
+    assert rows == other_rows
+    flat, other = checkpoint.flatten(state), checkpoint.flatten(other)
+    for path, leaf in flat.items():
+        np.testing.assert_array_equal(leaf, other[path], err_msg=path)
 
 
 @pytest.mark.parametrize("algo", CONFIGS)
@@ -129,10 +149,8 @@ def test_nan_in_a_motion_table(algo):
 
 @pytest.mark.parametrize("algo", CONFIGS)
 def test_nan_in_an_action(algo):
-    """Two steps into the second window of a quarter of the episodes."""
-    config = CONFIGS[algo]
-    window = config.ppo.window_steps if algo == "ppo" else config.first_order.horizon_steps
-    state, rows = _run(algo, 6, faulty(bad_action_at=window + 2))
+    """In a quarter of the episodes, in the first window (PPO) or the second (first-order)."""
+    state, rows = _run(algo, 6, faulty(bad_action_at=2 if algo == "ppo" else 10))
     _assert_finite(state)
     assert sum(row["reset_envs"] for row in rows) > 0
     assert max(row["rejected_share"] for row in rows) < 0.6
@@ -212,11 +230,12 @@ def test_ten_lost_iterations_end_the_run(algo, tmp_path, monkeypatch, capsys):
     with pytest.raises(UserError) as error:
         train(open_new(path, config), _make(), checkpoint_interval_s=0.0)
     message = str(error.value)
-    skipped = 8 if algo == "ppo" else 2
+    # PPO: the other half was just renewed. First-order: half in the first window, then all.
+    skipped, reset = (8, 32) if algo == "ppo" else (2, 48)
     assert message == (
         f"{path}: stopped at iteration 13: nothing was learned in 10 iterations in a row (in the "
         f"last one 100 % of the windows were left out, {skipped} updates skipped, "
-        f"{config.num_envs} environments reset); the checkpoint of iteration 3 is kept, the states "
+        f"{reset} environments reset); the checkpoint of iteration 3 is kept, the states "
         f"are in {path / 'diverged-13.npz'}; start another run with a smaller step size or another "
         "--seed"
     )
