@@ -51,7 +51,7 @@ def whole(lives):
 
 @pytest.mark.slow
 def test_killed_twenty_times(lives, whole):
-    """12 kills at operations on files (a checkpoint is some 90 of them), 12 at random times."""
+    """12 kills at operations on files (a checkpoint is 55 or more of them), 12 at random times."""
     draw = random.Random(20230207)
     kinds = [f"event:{draw.randint(1, 200)}" for _ in range(12)]
     kinds += [f"after:{draw.uniform(0.0, 2.0):.3f}" for _ in range(12)]
