@@ -1,12 +1,24 @@
-"""Checkpoints of a training state, by orbax: atomic, the last two kept, restored exactly.
+"""Checkpoints of a training state: written whole or not at all, verified, restored exactly.
 
-A state is stored as a flat dictionary {path of the leaf: array}, PRNG keys as their raw data, so
-that a checkpoint does not depend on how orbax treats our classes, and a mismatch can be named.
-Leaves without elements (a delay line of length 0) are left out: orbax refuses them.
+    checkpoints/ITERATION/state/          the arrays, by orbax
+    checkpoints/ITERATION/manifest.json   format, configuration, package versions, type and shape of
+                                          every array, SHA-256 of every file and of the manifest
+
+A checkpoint is made in `.ITERATION.partial` and gets its name by one rename when all of it, the
+manifest last, is on the disk. A state is stored as a flat dictionary {path of the leaf: array},
+PRNG keys as their raw data, so that a checkpoint does not depend on how orbax treats our classes,
+and a mismatch can be named. Leaves without elements (a delay line of length 0) are left out: orbax
+refuses them. Nothing is unpickled or executed (docs/trust.md).
 """
 
+import hashlib
 import json
 import logging
+import os
+import platform
+import shutil
+import sys
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -15,77 +27,205 @@ import jax.numpy as jnp
 
 from mcx_jax.errors import UserError
 
-FORMAT = 1
+FORMAT = 2
 KEEP = 2
 FOLDER = "checkpoints"
+MANIFEST = "manifest.json"
+STATE = "state"
+PACKAGES = ("mcx_jax", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy", "mujoco")
 
 
-def save(run_dir: Path, iteration: int, state: Any) -> None:
-    """Write the state after `iteration` iterations; whole or not at all, and only once."""
+class _Refused(Exception):
+    """Why a checkpoint cannot be used."""
+
+
+def save(run_dir: Path, iteration: int, state: Any, config: str = "") -> None:
+    """Write the state after `iteration` iterations; whole or not at all, and only once.
+
+    Args:
+        config: the run's configuration (`cli.config_to_json`).
+
+    Raises:
+        UserError: it cannot be written; the checkpoints that were there still are.
+    """
+    folder = (run_dir / FOLDER).absolute()
     if latest(run_dir) == iteration:
         return
-    args, flat = _orbax().args, _flatten(state)
-    meta = {"format": FORMAT, "iteration": iteration, "leaves": _types(flat)}
-    items = args.Composite(state=args.StandardSave(flat), meta=args.JsonSave(meta))
-    with _manager(run_dir) as manager:
-        manager.save(iteration, args=items, force=True)
-        manager.wait_until_finished()
+    partial = folder / f".{iteration}.partial"
+    flat = flatten(state)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for left in folder.glob(".*.partial"):  # by a killed process
+            shutil.rmtree(left)
+        partial.mkdir()
+        ocp = _orbax()
+        with ocp.Checkpointer(ocp.StandardCheckpointHandler()) as writer:
+            writer.save(partial / STATE, args=ocp.args.StandardSave(flat))
+        _write_manifest(partial, iteration, config, _types(flat))
+        partial.rename(folder / str(iteration))
+        _sync(folder)
+        for old in _iterations(run_dir)[:-KEEP]:
+            # Renamed first: half a directory must never look like a checkpoint.
+            gone = (folder / str(old)).rename(folder / f".{old}.partial")
+            shutil.rmtree(gone)
+    except (OSError, ValueError) as error:  # ValueError: tensorstore's
+        shutil.rmtree(partial, ignore_errors=True)
+        last = latest(run_dir)
+        kept = f"the checkpoint of iteration {last} is whole" if last else "there is none yet"
+        raise UserError(
+            f"{folder}: the checkpoint of iteration {iteration} cannot be written "
+            f"({_reason(error)}); {kept}: mend this, then go on with --resume"
+        ) from None
 
 
 def latest(run_dir: Path) -> int | None:
-    """Iteration of the newest whole checkpoint; None if there is none. Needs no JAX device."""
-    folder = run_dir / FOLDER
-    # An unfinished checkpoint has another name until it is renamed.
-    steps = [int(p.name) for p in folder.glob("*") if p.name.isdigit()] if folder.is_dir() else []
-    return max(steps, default=None)
+    """Iteration of the newest checkpoint; None if there is none. Needs no JAX device."""
+    return max(_iterations(run_dir), default=None)
 
 
-def restore_latest(run_dir: Path, like: Any) -> Any:
-    """The newest state.
+def check(run_dir: Path, iteration: int, config: str = "") -> dict[str, Any]:
+    """The manifest of a checkpoint whose files are as they were written. Needs no JAX device.
 
     Args:
-        like: a state, or its shapes (`jax.eval_shape`).
+        config: the configuration that it must be of; "" = any.
 
     Raises:
-        UserError: no checkpoint, an unreadable one, or one of another shape.
+        UserError: why it cannot be used, and from which one to go on instead.
     """
-    iteration = latest(run_dir)
+    where = run_dir / FOLDER / str(iteration)
+    there = _iterations(run_dir)
+    if iteration not in there:
+        choice = f"there are: {', '.join(map(str, there))}" if there else "there is none"
+        raise UserError(f"{run_dir}: no checkpoint of iteration {iteration}; {choice}")
+    try:
+        return _verified(where, config)
+    except _Refused as refused:
+        earlier = [i for i in reversed(there) if i < iteration and _usable(where.parent, i, config)]
+        way_out = (
+            f"go on from the one before it with --resume-from {earlier[0]}"
+            if earlier
+            else "there is no other to go on from; start again with another --run-dir"
+        )
+        raise UserError(f"{where}: {refused}; {way_out}") from None
+
+
+def restore(run_dir: Path, like: Any, iteration: int | None = None) -> Any:
+    """A state, bit for bit.
+
+    Args:
+        like: a state, or its shapes (`jax.eval_shape`); its shardings are where the arrays go.
+        iteration: None = the newest.
+
+    Raises:
+        UserError: no checkpoint, a damaged one, or one of another shape.
+    """
+    iteration = latest(run_dir) if iteration is None else iteration
     if iteration is None:
         raise UserError(f"{run_dir}: no checkpoint to go on from; start without --resume")
-    where = f"{run_dir / FOLDER / str(iteration)}"
-    wanted = _flatten(like)
-    _check(where, _meta(Path(where)), _types(wanted))
-    args = _orbax().args
+    where = (run_dir / FOLDER / str(iteration)).absolute()
+    wanted = flatten(like)
+    _check_types(where, check(run_dir, iteration)["leaves"], _types(wanted))
+    ocp = _orbax()
     try:
-        with _manager(run_dir) as manager:
-            items = args.Composite(state=args.StandardRestore(wanted))
-            stored = manager.restore(iteration, args=items).state
+        with ocp.Checkpointer(ocp.StandardCheckpointHandler()) as reader:
+            stored = reader.restore(where / STATE, args=ocp.args.StandardRestore(wanted))
     except (ValueError, KeyError, OSError, TypeError) as error:
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:120]
-        raise UserError(f"{where}: cannot be restored ({reason})") from None
+        raise UserError(f"{where}: cannot be restored ({_reason(error)})") from None
     return _unflatten(like, stored)
 
 
-def _types(flat: dict[str, Any]) -> dict[str, str]:
-    """Type and shape of every leaf, like float32[3, 4]."""
-    return {path: f"{leaf.dtype}{list(leaf.shape)}" for path, leaf in flat.items()}
+def set_aside_after(run_dir: Path, iteration: int) -> None:
+    """Give the checkpoints of later iterations names that are never restored: the run goes on from
+    an earlier one and writes them anew."""
+    for later in _iterations(run_dir):
+        if later > iteration:
+            name = run_dir / FOLDER / f"{later}.set-aside"
+            while name.exists():
+                name = name.with_name(f"{name.name}+")
+            (run_dir / FOLDER / str(later)).rename(name)
 
 
-def _meta(folder: Path) -> dict[str, Any]:
+def flatten(tree: Any) -> dict[str, Any]:
+    """{path: array or its shape}, keys as raw data, nothing without elements."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
+    flat = {jax.tree_util.keystr(path): _raw(leaf) for path, leaf in leaves}
+    return {path: leaf for path, leaf in flat.items() if leaf.size}
+
+
+def _iterations(run_dir: Path) -> list[int]:
+    folder = run_dir / FOLDER
+    return sorted(int(p.name) for p in folder.glob("*") if p.name.isdigit())
+
+
+def _write_manifest(folder: Path, iteration: int, config: str, leaves: dict[str, str]) -> None:
+    """The last file of a checkpoint; everything is on the disk when this returns."""
+    files = [p for p in sorted(folder.rglob("*")) if p.is_file()]
+    content = {
+        "iteration": iteration,
+        "config": config,
+        "packages": _packages(),
+        "leaves": leaves,
+        "files": {p.relative_to(folder).as_posix(): _digest(p) for p in files},
+    }
+    whole = {"format": FORMAT, "sha256": _digest_of(content), "content": content}
+    (folder / MANIFEST).write_text(json.dumps(whole, indent=1))
+    for path in (*files, folder / MANIFEST, *(p for p in folder.rglob("*") if p.is_dir()), folder):
+        _sync(path)
+
+
+def _verified(folder: Path, config: str) -> dict[str, Any]:
+    """The manifest's content, after every byte was compared with its checksum."""
+    content = _manifest(folder)
+    for name, digest in content["files"].items():
+        path = folder / name
+        if not path.is_file():
+            raise _Refused(f"damaged: {name} is missing")
+        if _digest(path) != digest:
+            raise _Refused(f"damaged: {name} is not what was written")
+    if config and content["config"] != config:
+        theirs, ours = content["config"].splitlines(), config.splitlines()
+        differ = [(a, b) for a, b in zip(theirs, ours, strict=False) if a != b] or [("?", "?")]
+        there, here = (line.strip().rstrip(",") for line in differ[0])
+        raise _Refused(f"of another run: {there} there and {here} here")
+    return content
+
+
+def _manifest(folder: Path) -> dict[str, Any]:
     try:
-        meta = json.loads((folder / "meta" / "metadata").read_text())
-        return {"format": meta["format"], "leaves": meta.get("leaves", {})}
+        whole = json.loads((folder / MANIFEST).read_text())
+        found, content, digest = whole["format"], whole.get("content", {}), whole.get("sha256")
     except (OSError, ValueError, KeyError, AttributeError, TypeError):
-        raise UserError(f"{folder}: not a checkpoint of mcx_jax, or damaged") from None
-
-
-def _check(where: str, meta: dict[str, Any], wanted: dict[str, str]) -> None:
-    """Refuse what does not fit before orbax starts to read."""
-    if meta["format"] != FORMAT:
-        raise UserError(
-            f"{where}: checkpoint of format {meta['format']}; this version reads {FORMAT}"
+        found, content, digest = _old_format(folder), {}, None
+    if found is None:
+        raise _Refused("not a checkpoint of mcx_jax, or damaged")
+    if found != FORMAT:
+        raise _Refused(
+            f"checkpoint of format {found}; this version reads {FORMAT}; go on with the version of "
+            "mcx_jax that wrote it"
         )
-    found = meta["leaves"]
+    if digest != _digest_of(content):
+        raise _Refused(f"damaged: {MANIFEST} is not what was written")
+    return content
+
+
+def _old_format(folder: Path) -> Any:
+    """Format of a checkpoint from before there were manifests; None: not even that."""
+    try:
+        return json.loads((folder / "meta" / "metadata").read_text())["format"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _usable(folder: Path, iteration: int, config: str) -> bool:
+    try:
+        _verified(folder / str(iteration), config)
+    except _Refused:
+        return False
+    return True
+
+
+def _check_types(where: Path, found: dict[str, str], wanted: dict[str, str]) -> None:
+    """Refuse what does not fit before orbax starts to read."""
     for path in sorted({*wanted, *found}):
         ours, theirs = wanted.get(path, "nothing"), found.get(path, "nothing")
         if ours != theirs:
@@ -94,29 +234,66 @@ def _check(where: str, meta: dict[str, Any], wanted: dict[str, str]) -> None:
             )
 
 
+def _packages() -> dict[str, str]:
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def _types(flat: dict[str, Any]) -> dict[str, str]:
+    """Type and shape of every leaf, like float32[3, 4]."""
+    return {path: f"{leaf.dtype}{list(leaf.shape)}" for path, leaf in flat.items()}
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _digest_of(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def _sync(path: Path) -> None:
+    """Wait until a file or a directory is on the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _reason(error: Exception) -> str:
+    text = getattr(error, "strerror", None) or str(error).strip() or type(error).__name__
+    return text.splitlines()[0][:300]
+
+
 def _orbax() -> Any:
     """orbax.checkpoint, loaded late (it takes seconds) and quiet about its own workings."""
     import orbax.checkpoint as ocp
 
-    logging.getLogger("absl").setLevel(logging.ERROR)
+    # What goes wrong is raised here; orbax's threads and tasks log it as well, as tracebacks.
+    for name in ("absl", "asyncio"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    if sys.unraisablehook is not _unraisable:
+        _unraisable.before = sys.unraisablehook
+        sys.unraisablehook = _unraisable
     return ocp
 
 
-def _manager(run_dir: Path) -> Any:
-    ocp = _orbax()
-    options = ocp.CheckpointManagerOptions(max_to_keep=KEEP, enable_async_checkpointing=False)
-    return ocp.CheckpointManager((run_dir / FOLDER).absolute(), options=options)
+def _unraisable(what: Any) -> None:
+    """When one array fails, orbax's threads for the others report, now or a moment later, to an
+    event loop that is closed by then. Everything else is shown as before."""
+    if str(what.exc_value) != "Event loop is closed":
+        _unraisable.before(what)
 
 
 def _is_key(leaf: Any) -> bool:
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
-def _flatten(tree: Any) -> dict[str, Any]:
-    """{path: array or its shape}, keys as raw data, nothing without elements."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
-    flat = {jax.tree_util.keystr(path): _raw(leaf) for path, leaf in leaves}
-    return {path: leaf for path, leaf in flat.items() if leaf.size}
 
 
 def _raw(leaf: Any) -> Any:

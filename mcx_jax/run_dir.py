@@ -1,11 +1,15 @@
 """The directory of a training run: {config.json, metrics.jsonl, checkpoints/, policy.npz}.
 
-Opening decides what may happen before anything is written; nothing is ever written over. Needs no
-JAX, so that a mistake is told at once.
+Opening decides what may happen before anything is written; nothing is ever written over. One
+process at a time holds it (`RunDir.held`), and whatever instant it is killed at, `--resume` goes on
+exactly (docs/trust.md). Needs no JAX device, so that a mistake is told at once.
 """
 
+import contextlib
+import fcntl
 import json
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +21,10 @@ from mcx_jax.errors import UserError
 CONFIG = "config.json"
 METRICS = "metrics.jsonl"
 POLICY = "policy.npz"
+LOCK = ".lock"
+"""Locked by the process that trains; the kernel lets go of it however that process ends."""
+LEFT_OVER = (LOCK, f".{CONFIG}.partial")
+"""What a run that was killed before it had a configuration leaves: nothing."""
 
 
 @dataclass(frozen=True)
@@ -28,22 +36,51 @@ class RunDir:
     start_iteration: int = 0
     """Iteration of the checkpoint to go on from; 0 = a new run."""
 
-    def create(self) -> None:
-        """Make the directory with config.json, and metrics up to where the run goes on from."""
-        self.path.mkdir(parents=True, exist_ok=True)
-        if not (self.path / CONFIG).exists():
-            _write_whole(self.path / CONFIG, cli.config_to_json(self.config))
-        _cut_metrics(self.path / METRICS, self.start_iteration)
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep every other process out; makes the directory.
 
-    def last_rows(self) -> list[dict[str, Any]]:
-        """The last iteration's rows of metrics.jsonl, one per seed; [] if there are none."""
-        lines = (self.path / METRICS).read_text().splitlines()[-self.config.seeds :]
-        return [json.loads(line) for line in lines]
+        Raises:
+            UserError: another process is in it, or was since it was opened; it cannot be written.
+        """
+        with writing(self.path):
+            self.path.mkdir(parents=True, exist_ok=True)
+            file = (self.path / LOCK).open("a")
+        with file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise UserError(
+                    f"{self.path}: another process is training here; wait for it, or name another "
+                    "--run-dir"
+                ) from None
+            if (self.path / CONFIG).exists():
+                _refuse_difference(self.path, self.config)
+            if not self.start_iteration and checkpoint.latest(self.path):
+                raise UserError(
+                    f"{self.path}: another process has trained here meanwhile; look, then --resume"
+                )
+            yield
+
+    def create(self) -> None:
+        """Write config.json, and metrics up to where the run goes on from."""
+        with writing(self.path):
+            if not (self.path / CONFIG).exists():
+                _write_whole(self.path / CONFIG, cli.config_to_json(self.config))
+            checkpoint.set_aside_after(self.path, self.start_iteration)
+            _cut_metrics(self.path / METRICS, self.start_iteration)
+
+    def last_rows(self, iterations: int = 1) -> list[dict[str, Any]]:
+        """Rows of metrics.jsonl of the last iterations, one per iteration and seed."""
+        lines = (self.path / METRICS).read_text().splitlines()
+        return [json.loads(line) for line in lines[-iterations * self.config.seeds :]]
 
     def append(self, rows: list[dict[str, Any]]) -> None:
         """Add rows to metrics.jsonl."""
-        with (self.path / METRICS).open("a") as file:
+        with writing(self.path), (self.path / METRICS).open("a") as file:
             file.writelines(json.dumps(row) + "\n" for row in rows)
+            file.flush()
+            os.fsync(file.fileno())  # a checkpoint must not be on the disk before its rows
 
 
 def default_path(config: TrainConfig) -> Path:
@@ -74,7 +111,7 @@ def open_new(path: Path, config: TrainConfig) -> RunDir:
     """
     if path.exists() and not path.is_dir():
         raise UserError(f"--run-dir {path}: is a file; name a directory")
-    if not path.is_dir() or not any(path.iterdir()):
+    if not path.is_dir() or not any(p.name not in LEFT_OVER for p in path.iterdir()):
         _check_writable(path)
         return RunDir(path, config)
     if not (path / CONFIG).is_file():
@@ -87,17 +124,20 @@ def open_new(path: Path, config: TrainConfig) -> RunDir:
     )
 
 
-def open_existing(path: Path, config: TrainConfig) -> RunDir:
+def open_existing(path: Path, config: TrainConfig, iteration: int = 0) -> RunDir:
     """The directory of a run to go on with.
 
+    Args:
+        iteration: of the checkpoint to go on from; 0 = the last one.
+
     Raises:
-        UserError: no run, one with another configuration, or one without a checkpoint.
+        UserError: no run, one with another configuration, or a checkpoint that cannot be used.
     """
     _refuse_difference(path, config)
-    iteration = checkpoint.latest(path)
-    if iteration is None:
-        # Stopped before its first checkpoint: it starts again from its beginning, which is exact.
-        return RunDir(path, config)
+    iteration = iteration or checkpoint.latest(path) or 0
+    if iteration:
+        checkpoint.check(path, iteration, cli.config_to_json(config))
+    # Stopped before its first checkpoint it starts again from its beginning, which is exact.
     return RunDir(path, config, iteration)
 
 
@@ -128,5 +168,19 @@ def _cut_metrics(path: Path, iteration: int) -> None:
 
 def _write_whole(path: Path, text: str) -> None:
     partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(text)
+    with partial.open("w") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
     partial.replace(path)
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """A disk that is full or may not be written is the user's to mend."""
+    try:
+        yield
+    except OSError as error:
+        raise UserError(
+            f"{path}: cannot be written ({error.strerror}); mend this, then go on with --resume"
+        ) from None

@@ -17,8 +17,17 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from mcx_jax import checkpoint, cli, machine, tensorboard
 from mcx_jax.config import TrainConfig, preset_config
+from mcx_jax.errors import UserError
 from mcx_jax.progress import Progress, short_time
-from mcx_jax.run_dir import POLICY, RunDir, default_path, open_existing, open_new, stored_config
+from mcx_jax.run_dir import (
+    POLICY,
+    RunDir,
+    default_path,
+    open_existing,
+    open_new,
+    stored_config,
+    writing,
+)
 from mcx_jax.stop import StopRequest
 
 if TYPE_CHECKING:
@@ -26,7 +35,6 @@ if TYPE_CHECKING:
     from mcx_jax.ppo.trainer import IterationMetrics, TrainState
     from mcx_jax.programs import Training
 
-CHECKPOINT_INTERVAL_S = 60.0
 FINAL_EPISODES, FINAL_STEPS = 50, 1000
 SMOKE_EPISODES, SMOKE_STEPS = 2, 96
 SMOKE_ITERATIONS = 3
@@ -40,6 +48,10 @@ class TrainCommand:
     """Directory of the run; default runs/<delay>-<preset or first-order>-s<seed>."""
     resume: bool = False
     """Go on with the run in --run-dir from its last checkpoint, exactly as if never stopped."""
+    resume_from: int = 0
+    """Go on from the checkpoint of this iteration; 0 = the last one."""
+    checkpoint_interval_s: float = 60.0
+    """Seconds between checkpoints; 0 = one after every iteration."""
     smoke: bool = False
     """Try the whole path on a tiny run (a minute), in a temporary directory unless --run-dir."""
     device: Literal["auto", "cpu", "gpu"] = "auto"
@@ -47,6 +59,15 @@ class TrainCommand:
     tensorboard: bool = False
     """Also write TensorBoard event files into the run's directory (extra viz)."""
     train: TrainConfig = field(default_factory=TrainConfig)
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be meant."""
+        for flag, value in (
+            ("--resume-from", self.resume_from),
+            ("--checkpoint-interval-s", self.checkpoint_interval_s),
+        ):
+            if not value >= 0:
+                raise UserError(f"{flag} {value}: must be 0 or a positive number")
 
 
 def smoke_config(config: TrainConfig) -> TrainConfig:
@@ -71,8 +92,9 @@ def smoke_config(config: TrainConfig) -> TrainConfig:
 def read_command(argv: list[str]) -> tuple[TrainCommand, RunDir]:
     """The command and its checked directory; nothing is written.
 
-    `--preset` and `--smoke` change the defaults of the other flags; with `--resume` the stored
-    configuration is the default, and a flag that contradicts it is refused.
+    `--preset` and `--smoke` change the defaults of the other flags; with `--resume` or
+    `--resume-from` the stored configuration is the default, and a flag that contradicts it is
+    refused.
     """
     algo = cli.value_of(argv, "--algo") or "ppo"
     defaults = preset_config(cli.value_of(argv, "--preset") or "fast", algo)
@@ -80,11 +102,11 @@ def read_command(argv: list[str]) -> tuple[TrainCommand, RunDir]:
         defaults = smoke_config(defaults)
     parse = functools.partial(cli.parse, TrainCommand, argv, prog="train")
     command = parse(default=TrainCommand(train=defaults))
-    if not command.resume:
+    if not command.resume and not command.resume_from:
         return command, open_new(_directory(command), command.train)
     path = Path(command.run_dir) if command.run_dir else default_path(command.train)
     command = parse(default=TrainCommand(train=stored_config(path)))
-    return command, open_existing(path, command.train)
+    return command, open_existing(path, command.train, command.resume_from)
 
 
 def _directory(command: TrainCommand) -> Path:
@@ -151,11 +173,14 @@ def save(run: RunDir, state: "TrainState", rows: list[dict[str, Any]]) -> "tuple
 
     policies = policies_of(run.config, state)
     best = max(range(len(policies)), key=lambda k: rows[k]["reward"] if rows else 0.0)
-    if len(policies) > 1:
-        for policy in policies:
-            save_policy(run.path / f"policy_s{policy.meta.seed}.npz", policy)
-    save_policy(run.path / POLICY, policies[best])
-    checkpoint.save(run.path, policies[0].meta.iteration, state)
+    with writing(run.path):
+        if len(policies) > 1:
+            for policy in policies:
+                save_policy(run.path / f"policy_s{policy.meta.seed}.npz", policy)
+        save_policy(run.path / POLICY, policies[best])
+    # Last: a run killed before goes on from the checkpoint before, and writes the policies again.
+    config = cli.config_to_json(run.config)
+    checkpoint.save(run.path, policies[0].meta.iteration, state, config)
     return policies[best], policies[best].meta.seed
 
 
@@ -165,44 +190,69 @@ def iterate(
     state: "TrainState",
     stop: StopRequest,
     events: "tensorboard.EventFile | None",
+    checkpoint_interval_s: float,
 ) -> "Policy":
     """Train to the end, or to the first iteration after a request to stop.
 
     Returns:
         The policy that was saved last.
+
+    Raises:
+        UserError: training has diverged, or the directory cannot be written.
     """
+    from mcx_jax.divergence import Watch
+
     config, progress = run.config, Progress(run.config, run.start_iteration)
+    watch = Watch(run)
     saved = time.monotonic()
     rows = run.last_rows()
     for iteration in range(run.start_iteration + 1, config.iterations + 1):
+        watch.before_iteration(state)
         state, metrics = training.iterate(state, iteration - 1)
         rows = metric_rows(config, iteration, metrics)
         run.append([{**row, "wall_s": time.monotonic() - progress.begun} for row in rows])
         if events:
             events.append(rows)
         progress.show(rows)
+        watch.after_iteration(state, rows)
         if stop.signum:
             break
-        if time.monotonic() - saved > CHECKPOINT_INTERVAL_S:
+        if time.monotonic() - saved > checkpoint_interval_s and not watch.lost:
+            watch.check(state, rows)
             save(run, state, rows)
             saved = time.monotonic()
+    watch.check(state, rows)
     policy, seed = save(run, state, rows)
     if config.seeds > 1:
         print(f"{run.path / POLICY}: seed {seed}, the best of {config.seeds} by training reward")
     return policy
 
 
-def train(run: RunDir, make_env: Callable[..., Any], *, events: bool = False) -> "Policy":
-    """Build the environment, compile, and train.
+def train(
+    run: RunDir,
+    make_env: Callable[..., Any],
+    *,
+    events: bool = False,
+    checkpoint_interval_s: float = 60.0,
+) -> "Policy":
+    """Build the environment, compile, and train; nobody else can use the directory meanwhile.
 
     Args:
         make_env: (env_config, motion_config, split="train") -> environment.
         events: write event files for TensorBoard, too.
 
     Raises:
-        UserError: the arm, the motion or the checkpoint cannot be used.
+        UserError: the arm, the motion, the checkpoint or the directory cannot be used; training
+            diverges.
         SystemExit: stopped by a signal, after saving.
     """
+    with run.held():
+        return _train(run, make_env, events, checkpoint_interval_s)
+
+
+def _train(
+    run: RunDir, make_env: Callable[..., Any], events: bool, checkpoint_interval_s: float
+) -> "Policy":
     from mcx_jax.programs import prepare
 
     config = run.config
@@ -216,7 +266,7 @@ def train(run: RunDir, make_env: Callable[..., Any], *, events: bool = False) ->
         flush=True,
     )
     if run.start_iteration:
-        state = checkpoint.restore_latest(run.path, training.like)
+        state = checkpoint.restore(run.path, training.like, run.start_iteration)
     else:
         state = training.start()
     run.create()
@@ -228,7 +278,7 @@ def train(run: RunDir, make_env: Callable[..., Any], *, events: bool = False) ->
             file = tensorboard.EventFile(run.path, config, run.start_iteration)
             stack.enter_context(file)
         stop = stack.enter_context(StopRequest())
-        policy = iterate(run, training, state, stop, file)
+        policy = iterate(run, training, state, stop, file, checkpoint_interval_s)
     if stop.signum and policy.meta.iteration < config.iterations:
         print(f"saved; go on with: python -m mcx_jax.train --run-dir {run.path} --resume")
         raise SystemExit(128 + stop.signum)
@@ -283,12 +333,21 @@ def main(argv: list[str] | None = None) -> None:
     from mcx_jax.envs.v2v import make_env
 
     try:
-        policy = train(run, make_env, events=command.tensorboard)
+        policy = train(
+            run,
+            make_env,
+            events=command.tensorboard,
+            checkpoint_interval_s=command.checkpoint_interval_s,
+        )
     except KeyboardInterrupt:
         print("\nstopped before the end of an iteration; go on with --resume if a run had begun")
         raise SystemExit(130) from None
     length = (SMOKE_EPISODES, SMOKE_STEPS) if command.smoke else (FINAL_EPISODES, FINAL_STEPS)
-    final_table(run.config, policy, *length)
+    try:
+        final_table(run.config, policy, *length)
+    except KeyboardInterrupt:
+        print(f"\nstopped before the table; python -m mcx_jax.evaluate {run.path} makes it")
+        raise SystemExit(130) from None
     print(f"done: {run.path / POLICY}")
 
 

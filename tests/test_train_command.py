@@ -59,7 +59,7 @@ def _like(config):
 
 
 def _state(path, config):
-    return checkpoint.restore_latest(path, _like(config))
+    return checkpoint.restore(path, _like(config))
 
 
 def _assert_same_run(one, other, config):
@@ -79,7 +79,7 @@ def _assert_same_run(one, other, config):
 
 def test_what_a_run_writes(finished, capsys):
     names = sorted(p.name for p in finished.iterdir())
-    assert names == ["checkpoints", "config.json", "metrics.jsonl", "policy.npz"]
+    assert names == [".lock", "checkpoints", "config.json", "metrics.jsonl", "policy.npz"]
     stored = cli.config_from_json(TrainConfig, (finished / "config.json").read_text())
     assert stored == CONFIG
     rows = [json.loads(line) for line in (finished / "metrics.jsonl").read_text().splitlines()]
@@ -115,10 +115,36 @@ def test_stopped_and_resumed_is_never_stopped(finished, tmp_path, monkeypatch, c
 def test_killed_before_the_first_checkpoint_starts_again(finished, tmp_path):
     path = tmp_path / "run"
     run = open_new(path, CONFIG)
-    run.create()
-    run.append([{"iteration": 1}])
+    with run.held():
+        run.create()
+        run.append([{"iteration": 1}])
     train(open_existing(path, CONFIG), _make_env)
     _assert_same_run(path, finished, CONFIG)
+
+
+def test_going_on_from_the_checkpoint_before(finished, tmp_path, capsys):
+    """The last one is damaged: refused with the flag that helps, which repeats what is lost."""
+    path = tmp_path / "run"
+    train(open_new(path, CONFIG), _make_env, checkpoint_interval_s=0.0)
+    folder = path / "checkpoints"
+    assert sorted(p.name for p in folder.iterdir()) == ["3", "4"]
+    (folder / "4" / "state" / "_METADATA").write_text("{}")
+    flags = ["--run-dir", str(path)]
+    before = _contents(path)
+    assert _refused([*flags, "--resume"], capsys) == (
+        f"{folder / '4'}: damaged: state/_METADATA is not what was written; go on from the one "
+        "before it with --resume-from 3"
+    )
+    assert _refused([*flags, "--resume-from", "2"], capsys) == (
+        f"{path}: no checkpoint of iteration 2; there are: 3, 4"
+    )
+    assert _contents(path) == before
+    command, run = read_command([*flags, "--resume-from", "3"])
+    assert command.train == CONFIG and run.start_iteration == 3
+    train(run, _make_env)
+    _assert_same_run(path, finished, CONFIG)
+    assert sorted(p.name for p in folder.iterdir()) == ["3", "4", "4.set-aside"]
+    assert (folder / "4.set-aside" / "state" / "_METADATA").read_text() == "{}"
 
 
 def test_several_seeds(tmp_path, capsys):
@@ -153,8 +179,11 @@ def finished_default(tmp_path):
     """A directory that looks like a finished run of `--num-envs 64 --total-steps 4096`."""
     path = tmp_path / "done"
     config = replace(preset_config("fast"), num_envs=64, total_steps=4096)
-    open_new(path, config).create()
-    (path / "checkpoints" / str(config.iterations)).mkdir(parents=True)
+    run = open_new(path, config)
+    with run.held():
+        run.create()
+    state = {"x": jax.numpy.ones(3)}
+    checkpoint.save(path, config.iterations, state, cli.config_to_json(config))
     return path
 
 
@@ -222,6 +251,11 @@ def test_strange_directories(tmp_path, capsys):
         ("--device tpu", "--device tpu: use one of auto, cpu, gpu"),
         ("--resum", "unknown option --resum: did you mean --resume? --help lists all"),
         ("--num-envs 2.5", "--num-envs 2.5: must be a whole number"),
+        ("--resume-from -1", "--resume-from -1: must be 0 or a positive number"),
+        (
+            "--checkpoint-interval-s nan",
+            "--checkpoint-interval-s nan: must be 0 or a positive number",
+        ),
     ],
 )
 def test_mistakes_in_flags(flags, message, tmp_path, monkeypatch, capsys):
@@ -281,7 +315,7 @@ def test_short_time():
 def test_restored_checkpoint_of_another_size_is_refused(finished):
     like = _like(replace(CONFIG, num_envs=16))
     with pytest.raises(UserError, match="cannot be restored"):
-        checkpoint.restore_latest(finished, like)
+        checkpoint.restore(finished, like)
 
 
 @pytest.mark.slow
@@ -293,7 +327,7 @@ def test_smoke_runs_the_whole_path(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     names = {p.name for p in (tmp_path / "run").iterdir()}
-    assert names == {"checkpoints", "config.json", "metrics.jsonl", "policy.npz"}
+    assert names == {".lock", "checkpoints", "config.json", "metrics.jsonl", "policy.npz"}
     assert "E1: explicit delay of 1 control steps = 20 ms" in done.stdout
     table = [line.split("│")[1:3] for line in done.stdout.splitlines() if line.startswith("│")]
     rows = [tuple(word.strip() for word in cells) for cells in table]

@@ -21,7 +21,7 @@ from mcx_jax.config import TrainConfig
 from mcx_jax.envs.chain import SMOOTH
 from mcx_jax.ppo.networks import init_params, step
 from mcx_jax.ppo.normalise import RunningStats, init_stats, merge, normalise_obs
-from mcx_jax.ppo.rollout import Actors, init_actors, insert_block, step_all
+from mcx_jax.ppo.rollout import Actors, init_actors, insert_block, replace_broken, step_all
 from mcx_jax.ppo.trainer import learning_rate, networks_of
 from mcx_jax.ppo.update import Fitted, gradient_step, init_fitted
 
@@ -62,6 +62,8 @@ class IterationMetrics:
         policy_grad_norm: mean over the windows, before clipping.
         skipped_updates: windows whose gradient was not finite.
         lr: step size.
+        reset_envs: environments that held a number that is not finite and were reset.
+        lost: 1 if nothing was learned: no step valid, or no gradient finite.
     """
 
     pos_error_mm: jax.Array
@@ -72,6 +74,8 @@ class IterationMetrics:
     policy_grad_norm: jax.Array
     skipped_updates: jax.Array
     lr: jax.Array
+    reset_envs: jax.Array
+    lost: jax.Array
 
 
 def training_env(env: Any) -> Any:
@@ -147,27 +151,30 @@ def iterate(
 
     def one_window(carry, _):
         fitted, actors = carry
+        actors, reset_envs = replace_broken(actors, fresh, config.shards)
         _, grads, (after, obs, metrics) = window_gradient(
             fitted.params, config, env, state.obs_stats, actors
         )
         fitted, stats = gradient_step(fitted, grads, lr, config.ppo.max_grad_norm)
-        return (fitted, after), (obs, metrics, stats)
+        return (fitted, after), (obs, metrics, stats, reset_envs)
 
-    (fitted, actors), (obs, metrics, stats) = jax.lax.scan(
+    (fitted, actors), (obs, metrics, stats, reset_envs) = jax.lax.scan(
         one_window, (state.learner.policy, actors), None, settings.windows
     )
-    valid = metrics.valid.astype(jnp.float32)
+    seen = metrics.valid & jnp.all(jnp.isfinite(obs), axis=-1)
     new_state = TrainState(
         learner=Learner(policy=fitted),
-        obs_stats=merge(state.obs_stats, obs, valid),
+        obs_stats=merge(state.obs_stats, obs, seen.astype(jnp.float32)),
         actors=actors,
         key=state.key,
         iteration=state.iteration + 1,
     )
-    return new_state, _metrics(metrics, valid, stats, lr)
+    return new_state, _metrics(metrics, stats, lr, jnp.sum(reset_envs))
 
 
-def _metrics(metrics: Any, valid: jax.Array, stats: Any, lr: jax.Array) -> IterationMetrics:
+def _metrics(metrics: Any, stats: Any, lr: jax.Array, reset_envs: jax.Array) -> IterationMetrics:
+    valid = metrics.valid.astype(jnp.float32)
+    learned = jnp.any(metrics.valid) & jnp.any(stats.skipped == 0)
     count = jnp.maximum(jnp.sum(valid), 1.0)
 
     def mean(x: jax.Array) -> jax.Array:
@@ -183,4 +190,6 @@ def _metrics(metrics: Any, valid: jax.Array, stats: Any, lr: jax.Array) -> Itera
         policy_grad_norm=jnp.mean(stats.grad_norm),
         skipped_updates=jnp.sum(stats.skipped),
         lr=jnp.asarray(lr, jnp.float32),
+        reset_envs=reset_envs,
+        lost=1.0 - learned,
     )

@@ -11,9 +11,11 @@ no step pays for a reset, no `cond` runs two branches under `vmap`, and all phas
 in every window. A window's end is a truncation, not an end: the value of the last observation
 follows. Where G does not divide N, or N < G, neighbouring blocks share an environment, which is
 then reset earlier than need be: a shorter episode, otherwise harmless. Each of S shards
-(`sharding`) has G blocks of its own, so that resetting moves nothing between devices.
+(`sharding`) has G blocks of its own, so that resetting moves nothing between devices. Where a
+number is not finite, the environment is replaced too (`replace_broken`).
 """
 
+import functools
 import itertools
 from dataclasses import replace
 from typing import Any
@@ -161,6 +163,51 @@ def insert_block(
         policy_carry=jax.tree.map(empty, actors.policy_carry),
         value_carry=jax.tree.map(empty, actors.value_carry),
     )
+
+
+def replace_broken(actors: Actors, fresh: Any, shards: int) -> tuple[Actors, jax.Array]:
+    """Put fresh environments in the place of those that hold a number that is not finite, in their
+    state or in a memory.
+
+    Several of a shard may get the same fresh environment: they draw other actions.
+
+    Args:
+        actors: of N environments.
+        fresh: environments just reset, leaves (..., S * n); number i mod n of its shard goes where
+            environment i of the shard broke.
+        shards: S, divides N.
+
+    Returns:
+        Actors, and how many were replaced, () float32.
+    """
+    num_envs, size = actors.env_state.obs.shape[-1], fresh.obs.shape[-1] // shards
+    source = jnp.arange(num_envs // shards) % size
+    memories = actors.policy_carry, actors.value_carry
+    broken = ~(_finite(actors.env_state, -1) & _finite(memories, 0))
+
+    def renew(old: jax.Array, new: jax.Array) -> jax.Array:
+        parts = over_envs(new.reshape(*new.shape[:-1], shards, size), -2)[..., source]
+        return over_envs(jnp.where(broken, parts.reshape(old.shape), old), -1)
+
+    def empty(old: jax.Array) -> jax.Array:
+        return over_envs(jnp.where(broken[:, None], 0.0, old), 0)
+
+    renewed = Actors(
+        env_state=jax.tree.map(renew, actors.env_state, fresh),
+        policy_carry=jax.tree.map(empty, actors.policy_carry),
+        value_carry=jax.tree.map(empty, actors.value_carry),
+    )
+    return renewed, jnp.sum(broken, dtype=jnp.float32)
+
+
+def _finite(tree: Any, axis: int) -> jax.Array:
+    """Whether all numbers along the other axes are finite, (N,)."""
+
+    def one(x: jax.Array) -> jax.Array:
+        return jnp.all(jnp.isfinite(x), [i for i in range(x.ndim) if i != axis % x.ndim])
+
+    floats = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)]
+    return functools.reduce(jnp.logical_and, map(one, floats))
 
 
 def act(

@@ -16,7 +16,7 @@ from mcx_jax.ppo.experience import Judged, judge
 from mcx_jax.ppo.loss import masked_mean
 from mcx_jax.ppo.networks import Networks, init_params, make_networks
 from mcx_jax.ppo.normalise import RunningStats, init_stats, merge
-from mcx_jax.ppo.rollout import Actors, Window, collect, init_actors, insert_block
+from mcx_jax.ppo.rollout import Actors, Window, collect, init_actors, insert_block, replace_broken
 from mcx_jax.ppo.update import Learner, UpdateStats, init_fitted, learn
 
 VALUE_KEEP = 0.9
@@ -69,6 +69,8 @@ class IterationMetrics:
         skipped_updates: steps left out for a gradient that was not finite.
         first_ratio_deviation: largest |ratio - 1| on the first minibatch: rounding, or a mistake.
         lr: step size of the policy.
+        reset_envs: environments that held a number that is not finite and were reset.
+        lost: 1 if nothing was learned: no window accepted, or no step of one of the networks made.
     """
 
     pos_error_mm: jax.Array
@@ -88,6 +90,8 @@ class IterationMetrics:
     skipped_updates: jax.Array
     first_ratio_deviation: jax.Array
     lr: jax.Array
+    reset_envs: jax.Array
+    lost: jax.Array
 
 
 def networks_of(config: PPOConfig, action_size: int) -> Networks:
@@ -147,6 +151,7 @@ def iterate(
         actors = insert_block(
             state.actors, fresh, state.iteration, config.reset_groups, config.shards
         )
+        actors, reset_envs = replace_broken(actors, fresh, config.shards)
         act_keys = _step_keys(ppo, act_key)
         params = state.learner.policy.params
         after, window = collect(env, nets, params, state.obs_stats, actors, act_keys)
@@ -179,7 +184,7 @@ def iterate(
         key=key,
         iteration=state.iteration + 1,
     )
-    return new_state, _metrics(window, judged, stats, learner, rates[0])
+    return new_state, _metrics(window, judged, stats, learner, rates[0], reset_envs)
 
 
 def rescale_value(learner: Learner, old: RunningStats, new: RunningStats) -> Learner:
@@ -202,12 +207,20 @@ def _step_keys(config: PPOConfig, key: jax.Array) -> jax.Array:
 
 
 def _metrics(
-    window: Window, judged: Judged, stats: UpdateStats, learner: Learner, lr: jax.Array
+    window: Window,
+    judged: Judged,
+    stats: UpdateStats,
+    learner: Learner,
+    lr: jax.Array,
+    reset_envs: jax.Array,
 ) -> IterationMetrics:
     env_metrics = window.steps.metrics
     valid = env_metrics.valid.astype(jnp.float32)
     raw_sigma = learner.policy.params["params"]["raw_sigma"]
     last = jnp.maximum(jnp.sum(stats.computed).astype(jnp.int32) - 1, 0)
+    policy_moved = jnp.any(stats.stepped > stats.policy_step.skipped)
+    value_moved = jnp.any(stats.value_step.skipped == 0)
+    learned = jnp.any(judged.mask > 0) & policy_moved & value_moved
     return IterationMetrics(
         pos_error_mm=1e3 * masked_mean(env_metrics.pos_error_m, valid),
         ang_error_mrad=1e3 * masked_mean(env_metrics.ang_error_rad, valid),
@@ -226,4 +239,6 @@ def _metrics(
         skipped_updates=jnp.sum(stats.policy_step.skipped + stats.value_step.skipped),
         first_ratio_deviation=stats.surrogate.ratio_deviation[0],
         lr=lr,
+        reset_envs=reset_envs,
+        lost=1.0 - learned,
     )
