@@ -284,7 +284,9 @@ class PPOConfig:
     initial_sigma: float = 0.3
     """Initial standard deviation of the actions, centimetres and centiradians (paper: 1.31)."""
     hidden: int = 128
-    """Width of the two dense layers and of the LSTM."""
+    """Width of the two dense layers and of the recurrent cell."""
+    cell: Literal["lstm", "gru"] = "lstm"
+    """Recurrent cell of both networks (paper: lstm)."""
     reject_mean_sq_reward: float = 0.008
     """A window (paper: episode) with a larger mean squared reward is masked out (authors' code)."""
 

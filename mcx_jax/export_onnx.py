@@ -67,7 +67,25 @@ def lstm(graph: Graph, weights: Weights, x: str) -> str:
     return graph.op("Mul", graph.op("Sigmoid", o), graph.op("Tanh", c), name="h_next")
 
 
-CELLS: dict[str, Callable[[Graph, Weights, str], str]] = {"lstm": lstm}
+def gru(graph: Graph, weights: Weights, x: str) -> str:
+    """`mcx_jax.ppo.gru` (gates reset, update, candidate): input h; output h_next.
+
+    Returns:
+        The cell's output.
+    """
+    pre = graph.affine(x, "cell", weights["input_kernel"], weights["bias"])
+    kernel = graph.constant("recurrent/kernel", weights["recurrent_kernel"])
+    recurrent = graph.op("MatMul", "h", kernel)
+    x_r, x_z, x_n = graph.split(pre, ("x_r", "x_z", "x_n"))
+    h_r, h_z, h_n = graph.split(recurrent, ("h_r", "h_z", "h_n"))
+    reset = graph.op("Sigmoid", graph.op("Add", x_r, h_r))
+    update = graph.op("Sigmoid", graph.op("Add", x_z, h_z))
+    candidate = graph.op("Tanh", graph.op("Add", x_n, graph.op("Mul", reset, h_n)))
+    kept = graph.op("Mul", update, graph.op("Sub", "h", candidate))
+    return graph.op("Add", candidate, kept, name="h_next")
+
+
+CELLS: dict[str, Callable[[Graph, Weights, str], str]] = {"lstm": lstm, "gru": gru}
 """How each kind of cell is written."""
 
 

@@ -11,7 +11,7 @@ import jax
 from mcx_jax.config import CONTROL_DT_S, parse_delay
 from mcx_jax.envs.observe import AGE, OBS_SIZE, OBS_TABLE, ObservationRow
 from mcx_jax.errors import UserError
-from mcx_jax.ppo.networks import PolicyNet, init_carry, make_cell
+from mcx_jax.ppo.networks import PolicyNet, init_carry
 from mcx_jax.ppo.normalise import CLIP, STD_FLOOR
 
 FRAMES = (
@@ -46,7 +46,7 @@ def describe(net: PolicyNet, obs_size: int, config: str) -> dict[str, Any]:
         "observation": _rows(observation),
         "action": _rows(action),
         "action_use": ACTION_USE,
-        "cell": cell_name(net),
+        "cell": net.cell,
         "state": state_sizes(net),
         "state_use": "zeros at the start of an episode; what comes out goes into the next step",
         "normalisation": {
@@ -55,11 +55,6 @@ def describe(net: PolicyNet, obs_size: int, config: str) -> dict[str, Any]:
             "clip": CLIP,
         },
     }
-
-
-def cell_name(net: PolicyNet) -> str:
-    """Kind of the recurrent cell, e.g. `lstm`."""
-    return type(make_cell(net.hidden)).__name__.lower()
 
 
 def state_sizes(net: PolicyNet) -> dict[str, int]:

@@ -15,12 +15,8 @@ import numpy as np
 
 
 class Policy:
-    """A policy that acts, one observation at a time.
-
-    Attributes:
-        interface: what goes in and out (names, order, units, frames, delay trained for).
-        state: memory {name: (H,) float32}, zeros at the start of an episode.
-    """
+    """A policy that acts, one observation at a time. `interface` says what goes in and out (names,
+    order, units, frames, delay trained for); `state` is its memory {name: (H,) float32}."""
 
     def __init__(self, path) -> None:
         with np.load(path, allow_pickle=False) as file:
@@ -28,14 +24,15 @@ class Policy:
                 raise ValueError(f"{path}: not an exported policy; use python -m mcx_jax.export")
             arrays = {name: file[name] for name in file.files}
         self.interface = json.loads(str(arrays["interface"]))
-        if self.interface["cell"] != "lstm":
-            raise ValueError(f"{path}: has a {self.interface['cell']} cell; this runs lstm")
+        if self.interface["cell"] not in CELLS:
+            raise ValueError(f"{path}: this runs {', '.join(CELLS)}, not {self.interface['cell']}")
+        self._advance = CELLS[self.interface["cell"]]
         normal = self.interface["normalisation"]
         self._mean, self._clip = arrays["obs/mean"], normal["clip"]
         self._std = np.maximum(np.sqrt(arrays["obs/var"]), np.float32(normal["std_floor"]))
-        self._layers = [_affine(arrays, f"policy/net/{x}") for x in ("dense_0", "dense_1", "head")]
-        kernels = [arrays[f"policy/net/cell/{x}_kernel"] for x in ("input", "recurrent")]
-        self._cell = np.concatenate(kernels), arrays["policy/net/cell/bias"]
+        part = lambda name, *of: [arrays[f"policy/net/{name}/{x}"] for x in of]  # noqa: E731
+        self._layers = [part(x, "kernel", "bias") for x in ("dense_0", "dense_1", "head")]
+        self._cell = part("cell", "input_kernel", "recurrent_kernel", "bias")
         self.reset()
 
     def reset(self) -> None:
@@ -55,14 +52,9 @@ class Policy:
         x = x.astype(np.float32)
         for kernel, bias in self._layers[:2]:
             x = np.tanh(x @ kernel + bias)
-        kernel, bias = self._cell
-        gates = np.concatenate([x, self.state["h"]]) @ kernel + bias
-        i, f, g, o = np.split(gates, 4)  # input, forget, cell, output
-        c = _sigmoid(f) * self.state["c"] + _sigmoid(i) * np.tanh(g)
-        h = _sigmoid(o) * np.tanh(c)
-        self.state = {"c": c, "h": h}
+        self.state = self._advance(x, self.state, *self._cell)
         kernel, bias = self._layers[2]
-        return (x + h) @ kernel + bias
+        return (x + self.state["h"]) @ kernel + bias
 
 
 def observation(T_B_G, T_B_E) -> np.ndarray:
@@ -87,9 +79,21 @@ def corrected_goal(T_B_G, action) -> np.ndarray:
     return goal
 
 
-def _affine(arrays, name: str) -> tuple[np.ndarray, np.ndarray]:
-    return arrays[f"{name}/kernel"], arrays[f"{name}/bias"]
+def _lstm(x, state, w_x, w_h, bias) -> dict:
+    i, f, g, o = np.split(x @ w_x + state["h"] @ w_h + bias, 4)  # input, forget, cell, output
+    c = _sigmoid(f) * state["c"] + _sigmoid(i) * np.tanh(g)
+    return {"c": c, "h": _sigmoid(o) * np.tanh(c)}
+
+
+def _gru(x, state, w_x, w_h, bias) -> dict:
+    new, old = np.split(x @ w_x + bias, 3), np.split(state["h"] @ w_h, 3)
+    reset, update = _sigmoid(new[0] + old[0]), _sigmoid(new[1] + old[1])
+    candidate = np.tanh(new[2] + reset * old[2])
+    return {"h": candidate + update * (state["h"] - candidate)}
 
 
 def _sigmoid(x: np.ndarray) -> np.ndarray:
     return 0.5 + 0.5 * np.tanh(0.5 * x)  # no overflow for large |x|
+
+
+CELLS = {"lstm": _lstm, "gru": _gru}

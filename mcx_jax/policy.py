@@ -40,6 +40,8 @@ class PolicyMeta:
     """Length of the action."""
     hidden: int
     """Width of the network."""
+    cell: str = "lstm"
+    """Its recurrent cell."""
     config: str = "{}"
     """Configuration of the training run, JSON (`cli.config_from_json`)."""
     iteration: int = 0
@@ -50,7 +52,7 @@ class PolicyMeta:
     @property
     def net(self) -> PolicyNet:
         """The network, without weights."""
-        return PolicyNet(self.hidden, self.action_size)
+        return PolicyNet(self.hidden, self.action_size, cell=self.cell)
 
     @property
     def interface(self) -> dict[str, Any]:

@@ -154,6 +154,7 @@ def policies_of(config: TrainConfig, state: "TrainState") -> "list[Policy]":
             obs_size=stats.mean.shape[-1],
             action_size=actions,
             hidden=config.ppo.hidden,
+            cell=config.ppo.cell,
             config=cli.config_to_json(config),
             iteration=int(iteration),
             seed=config.seed + k,

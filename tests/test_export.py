@@ -105,6 +105,31 @@ def expected(policy):
     return observations, np.stack(actions)
 
 
+def test_a_gru_is_the_same_in_all_forms(tmp_path, expected):
+    observations, _ = expected
+    meta = PolicyMeta(obs_size=observe.OBS_SIZE, action_size=6, hidden=HIDDEN, cell="gru")
+    stats = RunningStats(jnp.ones(()), jnp.float32(MEAN), jnp.float32(STD**2))
+    policy = Policy(init_params(meta.net, jax.random.key(4), observe.OBS_SIZE), stats, meta)
+    save_policy(tmp_path / "gru.npz", policy)
+    for form in ("onnx", "stablehlo"):
+        main([str(tmp_path / "gru.npz"), "--out", str(tmp_path / f"gru.{form}")])
+    runner = numpy_policy.Policy(tmp_path / "gru.npz")
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(tmp_path / "gru.onnx")
+    hlo = jax.export.deserialize(bytearray((tmp_path / "gru.stablehlo").read_bytes())).call
+    carry, step, h = init_carry(policy, (1,)), jax.jit(act), np.zeros((1, HIDDEN), np.float32)
+    h_hlo = h
+    for x in observations[:10, :1]:
+        carry, want = step(policy, carry, x)
+        action, h = session.run(["action", "h_next"], {"observation": x, "h": h})
+        out = hlo(observation=x, h=h_hlo)
+        h_hlo = out["h_next"]
+        for got in (runner.step(x[0])[None], action, out["action"]):
+            np.testing.assert_allclose(got, want, atol=1e-5)
+    assert np.abs(h).max() > 0.1
+
+
 def check_against(expected, step):
     """`step(observation, c, h)`, by name, gives JAX's actions with its own memory carried."""
     observations, actions = expected
@@ -240,8 +265,8 @@ def test_numpy_runner_refuses_what_would_spoil_its_memory(exported, run_dir, tmp
     np.savez(old, **arrays)
     with pytest.raises(ValueError, match="not an exported policy; use python -m mcx_jax.export"):
         numpy_policy.Policy(old)
-    np.savez(old, interface=json.dumps({**said, "cell": "gru"}), **arrays)
-    with pytest.raises(ValueError, match="has a gru cell; this runs lstm"):
+    np.savez(old, interface=json.dumps({**said, "cell": "mlp"}), **arrays)
+    with pytest.raises(ValueError, match="this runs lstm, gru, not mlp"):
         numpy_policy.Policy(old)
 
 

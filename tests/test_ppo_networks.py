@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcx_jax.ppo import dense, lstm
+from mcx_jax.ppo import dense, gru, lstm
 from mcx_jax.ppo import networks as nw
 
 HIDDEN, OBS, ACTIONS, TIME, BATCH = 16, 5, 3, 7, 4
@@ -73,6 +73,32 @@ def test_cell_against_flax():
     np.testing.assert_allclose(ours.c, c, atol=1e-6)
     np.testing.assert_allclose(ours.h, h, atol=1e-6)
     np.testing.assert_allclose(y, z, atol=1e-6)
+
+
+def test_gru_against_flax():
+    cell, h = gru.GRU(HIDDEN), 0.5 * jax.random.normal(jax.random.key(3), (BATCH, HIDDEN))
+    x = jax.random.normal(jax.random.key(2), (TIME, BATCH, HIDDEN))
+    params = cell.init(jax.random.key(1), gru.GRUCarry(h), x[0], method="step")["params"]
+    params["bias"] = 0.3 * jax.random.normal(jax.random.key(4), params["bias"].shape)
+    mapped = {}
+    for k, gate in enumerate("rzn"):
+        columns = slice(k * HIDDEN, (k + 1) * HIDDEN)
+        mapped[f"i{gate}"] = {
+            "kernel": params["input_kernel"][:, columns],
+            "bias": params["bias"][columns],
+        }
+        mapped[f"h{gate}"] = {"kernel": params["recurrent_kernel"][:, columns]}
+    mapped["hn"]["bias"] = jnp.zeros(HIDDEN)
+    carry, z = h, []
+    for t in range(TIME):
+        carry, y = nn.GRUCell(HIDDEN).apply({"params": mapped}, carry, x[t])
+        z.append(y)
+    last, ours = cell.apply({"params": params}, gru.GRUCarry(h), x, method="unroll")
+    np.testing.assert_allclose(ours, jnp.stack(z), atol=2e-6)
+    np.testing.assert_array_equal(last.h, ours[-1])
+    one, y = cell.apply({"params": params}, gru.GRUCarry(h), x[0], method="step")
+    np.testing.assert_allclose(y, ours[0], atol=1e-6)
+    np.testing.assert_array_equal(one.h, y)
 
 
 def test_written_out_reverse_mode_is_the_derivative(sequence):

@@ -45,7 +45,7 @@ class LSTM(nn.Module):
             "input_kernel", nn.initializers.lecun_normal(), (self.features, width)
         )
         self.recurrent_kernel = self.param(
-            "recurrent_kernel", _orthogonal_gates, (self.features, width)
+            "recurrent_kernel", orthogonal_blocks, (self.features, width)
         )
         self.bias = self.param("bias", _forget_bias_one, (width,))
 
@@ -71,8 +71,8 @@ def _gates(kernel: jax.Array, bias: jax.Array, x: jax.Array, h: jax.Array) -> ja
     return _activate(affine(jnp.concatenate([x, h], axis=-1), kernel, bias))
 
 
-def _orthogonal_gates(key: jax.Array, shape: tuple[int, int]) -> jax.Array:
-    """Four orthogonal (H, H) blocks side by side: each gate keeps the norm of what it reads.
+def orthogonal_blocks(key: jax.Array, shape: tuple[int, int]) -> jax.Array:
+    """Orthogonal (H, H) blocks side by side: each gate keeps the norm of what it reads.
 
     The orthogonal factor of a Gaussian matrix by Newton-Schulz iteration (small singular values
     grow by 1.5 a step), not by QR: jaxlib's batched LAPACK calls wait in XLA's thread pool for
@@ -80,7 +80,7 @@ def _orthogonal_gates(key: jax.Array, shape: tuple[int, int]) -> jax.Array:
     with two cores wait for each other for ever.
     """
     size = shape[0]
-    blocks = jax.random.normal(key, (4, size, size))
+    blocks = jax.random.normal(key, (shape[1] // size, size, size))
     blocks = blocks / jnp.linalg.norm(blocks, axis=(1, 2), keepdims=True)
 
     def improve(_: int, x: jax.Array) -> jax.Array:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mcx_jax.ppo.dense import Dense
+from mcx_jax.ppo.gru import GRU
 from mcx_jax.ppo.lstm import LSTM
 
 Params = Any
@@ -26,14 +27,13 @@ HEAD_SCALE_POLICY = 0.01
 the goal by centimetres."""
 
 
-def make_cell(hidden: int) -> nn.Module:
-    """The recurrent cell of the torso; another kind of cell is chosen here and nowhere else."""
-    return LSTM(hidden)
+CELLS = {"lstm": LSTM, "gru": GRU}
+"""Recurrent cells by the name that `--cell` gives them."""
 
 
 def init_carry(net: "PolicyNet | ValueNet", batch: tuple[int, ...]) -> Carry:
     """The memory of environments of shape `batch` at the start of an episode."""
-    return make_cell(net.hidden).init_carry(batch)
+    return CELLS[net.cell](net.hidden).init_carry(batch)
 
 
 class RecurrentNet(nn.Module):
@@ -42,16 +42,18 @@ class RecurrentNet(nn.Module):
     Attributes:
         hidden: width H of the dense layers and of the cell.
         outputs: width O of the head.
+        cell_name: the recurrent cell, see CELLS.
         head_scale: size of the head's initial weights.
     """
 
     hidden: int
     outputs: int
+    cell_name: str
     head_scale: float = 1.0
 
     def setup(self) -> None:
         self.dense = [Dense(self.hidden) for _ in range(2)]
-        self.cell = make_cell(self.hidden)
+        self.cell = CELLS[self.cell_name](self.hidden)
         scale = nn.initializers.variance_scaling(self.head_scale**2, "fan_in", "normal")
         self.head = Dense(self.outputs, kernel_init=scale)
 
@@ -79,9 +81,10 @@ class PolicyNet(nn.Module):
     hidden: int
     actions: int
     initial_sigma: float = 1.0
+    cell: str = "lstm"
 
     def setup(self) -> None:
-        self.net = RecurrentNet(self.hidden, self.actions, HEAD_SCALE_POLICY)
+        self.net = RecurrentNet(self.hidden, self.actions, self.cell, HEAD_SCALE_POLICY)
         raw = float(np.log(np.expm1(self.initial_sigma)))  # softplus(raw) = initial_sigma
         self.raw_sigma = self.param("raw_sigma", nn.initializers.constant(raw), (self.actions,))
 
@@ -100,9 +103,10 @@ class ValueNet(nn.Module):
     """Normalised value of the present state (`ppo.normalise` holds the scale)."""
 
     hidden: int
+    cell: str = "lstm"
 
     def setup(self) -> None:
-        self.net = RecurrentNet(self.hidden, 1)
+        self.net = RecurrentNet(self.hidden, 1, self.cell)
 
     def step(self, carry: Carry, obs: jax.Array) -> tuple[Carry, jax.Array]:
         """obs (..., F) -> carry, value (...)."""
@@ -123,9 +127,9 @@ class Networks:
     value: ValueNet
 
 
-def make_networks(hidden: int, initial_sigma: float, actions: int) -> Networks:
+def make_networks(hidden: int, initial_sigma: float, actions: int, cell: str = "lstm") -> Networks:
     """The networks of a configuration."""
-    return Networks(PolicyNet(hidden, actions, initial_sigma), ValueNet(hidden))
+    return Networks(PolicyNet(hidden, actions, initial_sigma, cell), ValueNet(hidden, cell))
 
 
 def init_params(net: "PolicyNet | ValueNet", key: jax.Array, obs_size: int) -> Params:

@@ -96,7 +96,7 @@ class IterationMetrics:
 
 def networks_of(config: PPOConfig, action_size: int) -> Networks:
     """The networks of a configuration, without weights."""
-    return make_networks(config.hidden, config.initial_sigma, action_size)
+    return make_networks(config.hidden, config.initial_sigma, action_size, config.cell)
 
 
 def init(config: TrainConfig, env: Any, seed: jax.Array, blocks: list[Any]) -> TrainState:
