@@ -119,7 +119,7 @@ def episode_errors(env, controller, gains: tuple[float, ...], episodes: int, see
     seas = jnp.broadcast_to(jnp.arange(shape[1], dtype=jnp.int32)[:, None], shape).ravel()
     gain = jnp.broadcast_to(jnp.asarray(gains)[:, None, None], shape).ravel()
     mesh = env_mesh(keys.size)
-    env, controller = put(mesh, (env, controller))
+    env, controller = put(mesh, (env.replace(whole_batches=True), controller))
     keys, seas, gain = put(mesh, (keys, seas, gain), 0)
     with jax.set_mesh(mesh):
         dp, da, valid, action, share = jax.device_get(

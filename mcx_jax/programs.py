@@ -11,7 +11,7 @@ s), and now compiles beside the iteration.
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from types import ModuleType
 from typing import Any
@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from mcx_jax.config import TrainConfig
+from mcx_jax.envs.v2v import V2VEnv
 from mcx_jax.ppo.rollout import layout, reset_all
 from mcx_jax.sharding import env_mesh, put, shardings
 
@@ -92,6 +93,8 @@ def prepare(config: TrainConfig, env: Any, mesh: Mesh | None = None) -> Training
     """
     mesh = env_mesh(config.shards) if mesh is None else mesh
     algo = algorithm(config)
+    if isinstance(env, V2VEnv):
+        env = replace(env, whole_batches=True)
     env = put(mesh, env)
     resets, inits = partial(reset, config), partial(algo.init, config)
     iterates = partial(algo.iterate, config)

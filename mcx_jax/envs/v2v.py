@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from flax import struct
 from mujoco import MjModel
 
+from mcx_jax.batch_last import batch_last
 from mcx_jax.config import CONTROL_DT_S, PHYSICS_DT_S, SUBSTEPS, Delay, EnvConfig, MotionConfig
 from mcx_jax.envs import chain, conditions, ik, lag, observe, vessels
 from mcx_jax.envs.conditions import Conditions, Measurement
@@ -101,6 +102,8 @@ class V2VEnv:
     """euler, implicitfast or mixed; with the chain engine also these with the ending -smooth."""
     goal_path: GoalPath | None = None
     """None: the goal stays where it is drawn."""
+    whole_batches: bool = struct.field(pytree_node=False, default=False)
+    """Traces faster under vmap, but can be differentiated outside it only (`batch_last`)."""
 
     @property
     def delays(self) -> tuple[Delay, ...]:
@@ -158,11 +161,11 @@ class V2VEnv:
         with jax.named_scope("vessels"):
             seg_a, seg_b = self._segments(track, jnp.int32(0))
             place = self.goal_on_deck(goal_m, drawn, jnp.int32(0))
-            goal = stage(self.wall, vessels.goal_in_base, seg_a, seg_b, place, 0)
+            goal = self._goal(seg_a, seg_b, place, 0)
             measured = conditions.first_measurement(drawn, self.config, goal)
         with jax.named_scope("ik"):
             start = jnp.asarray(_start_pose(self.model), goal_m.dtype)
-            found = ik.solve(self.model, start, goal, ik.COLD_ITERATIONS, self.wall)
+            found = self._solve(start, goal, ik.COLD_ITERATIONS)
         with jax.named_scope("settle"):
             arm = ArmState(q=found.q, qd=jnp.zeros_like(found.q))
             still = vessels.still(seg_a)
@@ -195,16 +198,16 @@ class V2VEnv:
         with jax.named_scope("correct"):
             bound = self.config.max_correction
             action = jnp.clip(action, -bound, bound)
-            target = stage(self.wall, correct, state.measured.pose, action)
+            target = self._whole(_corrected, state.measured, action)
         with jax.named_scope("ik"):
-            found = ik.solve(self.model, state.arm.q, target, ik.WARM_ITERATIONS, self.wall)
+            found = self._solve(state.arm.q, target, ik.WARM_ITERATIONS)
         with jax.named_scope("lag"):
             lag_state, reference = lag.apply_one(self.delays, drawn.delay, state.lag, found.q)
             rate = _rate(state, reference)
         with jax.named_scope("vessels"):
             seg_a, seg_b = self._segments(state.track, state.step)
             place = self.goal_on_deck(state.goal_m, drawn, (state.step + 1) * SUBSTEPS)
-            goal = stage(self.wall, vessels.goal_in_base, seg_a, seg_b, place, SUBSTEPS)
+            goal = self._goal(seg_a, seg_b, place, SUBSTEPS)
         with jax.named_scope("arm"):
             arm = self._simulate(state.arm, reference, rate, seg_a, SUBSTEPS, drawn)
         with jax.named_scope("observe"):
@@ -254,15 +257,40 @@ class V2VEnv:
         self, arm: ArmState, goal: tuple[Mat, Vec], measured: Measurement, drawn: Conditions
     ):
         """True errors (dp m, da rad), and the observation, made of what is measured."""
-        tool = ik.tool_pose(self.model, unpack(arm.q, self.model.nq), self.wall)
-        errors = stage(self.wall, observe.tracking_error, goal, tool)
-        if not self.config.conditions.imperfect_sensor:
-            return errors, observe.observe(goal, tool, errors)
-        seen = stage(self.wall, observe.tracking_error, measured.pose, tool)
-        obs = observe.observe(measured.pose, tool, seen)
+        perfect = not self.config.conditions.imperfect_sensor
+
+        def look(wall, q, goal, measured):
+            tool = ik.tool_pose(self.model, unpack(q, self.model.nq), wall)
+            errors = stage(wall, observe.tracking_error, goal, tool)
+            if perfect:
+                return errors, observe.observe(goal, tool, errors)
+            seen = stage(wall, observe.tracking_error, measured.pose, tool)
+            return errors, observe.observe(measured.pose, tool, seen)
+
+        errors, obs = self._whole(look, arm.q, goal, measured)
         if drawn.latency is not None:
             obs = jnp.append(obs, drawn.age_s)
         return errors, obs
+
+    def _whole(self, f, *args):
+        """f(wall, *args), on whole batches where asked."""
+        return (batch_last(f) if self.whole_batches else f)(self.wall, *args)
+
+    def _goal(self, seg_a: Segment, seg_b: Segment, place: jax.Array, i: int) -> tuple[Mat, Vec]:
+        """True T_G^B at physics step i of a control step."""
+
+        def pose(wall, seg_a, seg_b, place):
+            return stage(wall, vessels.goal_in_base, seg_a, seg_b, place, i)
+
+        return self._whole(pose, seg_a, seg_b, place)
+
+    def _solve(self, start: jax.Array, target: tuple[Mat, Vec], iterations: int) -> ik.IKResult:
+        """Joint angles that bring the tool to a pose; the branch next to `start`."""
+
+        def solve(wall, start, target):
+            return ik.solve(self.model, start, target, iterations, wall)
+
+        return self._whole(solve, start, target)
 
     def _segments(self, track: Track, step: jax.Array) -> tuple[Segment, Segment]:
         """Motion of both vessels during the control step that begins at `step` (20 ms units)."""
@@ -284,15 +312,18 @@ class V2VEnv:
         """The engine behind one function: physics steps of 2 ms with the references held."""
         ctrl = command(self.model, reference, rate)
         # The engines advance a base at physics step i by the deck's motion at that instant.
-        base_at = lambda i: vessels.base_state(seg_a, i, self.wall)  # noqa: E731
         if self.mjx_model is None:
-            system = self.model, self.integrator
-            q, qd = chain.substeps(
-                *system, arm.q, arm.qd, ctrl, base_at, count, self.wall, drawn.plant
-            )
+
+            def simulate(wall, q, qd, ctrl, seg_a, plant):
+                base_at = lambda i: vessels.base_state(seg_a, i, wall)  # noqa: E731
+                system = self.model, self.integrator
+                return chain.substeps(*system, q, qd, ctrl, base_at, count, wall, plant)
+
+            q, qd = self._whole(simulate, arm.q, arm.qd, ctrl, seg_a, drawn.plant)
         else:
             from mcx_jax.envs import mjx_engine
 
+            base_at = lambda i: vessels.base_state(seg_a, i, self.wall)  # noqa: E731
             q, qd = mjx_engine.substeps(self.mjx_model, arm.q, arm.qd, ctrl, base_at, count)
         return ArmState(q=q, qd=qd)
 
@@ -301,6 +332,10 @@ def _rate(before: EnvState, reference: jax.Array) -> jax.Array:
     """(nq,) finite difference of the late reference, rad/s; 0 in the first step (authors' code)."""
     rate = (reference - before.reference) / CONTROL_DT_S
     return jnp.where(before.step == 0, 0.0, rate)
+
+
+def _corrected(wall: jax.Array | None, measured: Measurement, action: jax.Array):
+    return stage(wall, correct, measured.pose, action)
 
 
 def correct(goal: tuple[Mat, Vec], action: jax.Array) -> tuple[Mat, Vec]:
