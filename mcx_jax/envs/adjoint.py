@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from mcx_jax.envs.dynamics import BaseState, inertial_wrench, link_motion
 from mcx_jax.envs.model import ChainModel, Link
@@ -87,7 +88,9 @@ def _pull_back(link: Link, carry: Carry, joint: Joint, d_after: Any) -> tuple[An
             return own
         return add(own, _inner(after, d_after))
 
-    gradient = jax.grad(power)(traced)
+    # Not jax.grad: in a whole batch (mcx_jax.batch_last) the power is one number an environment.
+    value, pull = jax.vjp(power, traced)
+    (gradient,) = pull(jnp.ones_like(value))
     d_carry, (d_sin, d_cos, d_rate) = join(gradient)
     sin, cos = joint[0], joint[1]
     return d_carry, sub(mul(cos, d_sin), mul(sin, d_cos)), d_rate
