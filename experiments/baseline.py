@@ -1,6 +1,6 @@
 """The controllers without learning on the paper's five delays and four seas.
 
-    python experiments/baseline.py ik extrapolate preview
+    python experiments/baseline.py ik extrapolate extrapolate-best fir preview
 
 Writes experiments/baseline_WHO.csv; for `ik` prints how close it is to the baseline that the
 paper's table 3 implies (rms of the 40 log ratios, worst cell).
@@ -18,17 +18,18 @@ from mcx_jax.config import NAMED_DELAYS, EnvConfig, MotionConfig
 
 def main() -> None:
     startup.configure()
-    from mcx_jax.controllers import CLASSICAL
-    from mcx_jax.evaluate import evaluate
+    from mcx_jax.evaluate import WHO, evaluate, fit_if_needed, load_controller
 
     names = sys.argv[1:] or ["ik"]
-    if unknown := set(names) - set(CLASSICAL):
-        raise SystemExit(f"unknown controller {unknown}: use {', '.join(CLASSICAL)}")
+    if unknown := set(names) - set(WHO):
+        raise SystemExit(f"unknown controller {unknown}: use {', '.join(WHO)}")
     for who in names:
         rows = []
         for delay in NAMED_DELAYS:
             begun = time.monotonic()
-            found = evaluate(who, CLASSICAL[who], EnvConfig(delay=delay), MotionConfig())
+            env, motion = EnvConfig(delay=delay), MotionConfig()
+            controller = fit_if_needed(who, load_controller(who)[1], env, motion, "")
+            found = evaluate(who, controller, env, motion)
             rows += evaluation_rows(found, time.monotonic() - begun)
             print(f"{who} {delay}: {time.monotonic() - begun:.0f} s", flush=True)
         if who == "ik":

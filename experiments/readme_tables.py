@@ -26,6 +26,33 @@ def read(name: str) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+CLASSICAL = (
+    "baseline_ik",
+    "baseline_extrapolate",
+    "baseline_extrapolate-best",
+    "baseline_fir",
+    "baseline_preview",
+)
+
+
+def over_seeds(name: str) -> list[dict[str, str]]:
+    """Rows of experiments/NAME.csv, one for each delay and sea: interquartile means over seeds."""
+    from mcx_jax.results import interquartile_mean
+
+    groups: dict[tuple[str, str, str], list[dict[str, str]]] = {}
+    for row in read(name):
+        groups.setdefault((row["who"], row["delay"], row["sea"]), []).append(row)
+    out = []
+    for rows in groups.values():
+        mean = {
+            key: f"{interquartile_mean([float(r[key]) for r in rows]):.3f}"
+            for key in rows[0]
+            if key.startswith(("pos_mm", "ang_mrad", "gain_")) and not key.endswith("_paper")
+        }
+        out.append({**rows[0], **mean, "seeds": str(len(rows))})
+    return out
+
+
 def source(row: dict[str, str]) -> str:
     return f"`{row['command']}` (commit {row['commit']}, {row['device']}, jax {row['jax']})"
 
@@ -48,8 +75,8 @@ def headline() -> str:
         rows.append(
             ["IK baseline against table 3's implied one, 40 cells", value, source(cells[0])]
         )
-    for name, label in (("train_2m", "PPO"), ("first_order", "gradient through the simulator")):
-        stored = [r for r in read(name) if r["delay"] == "B4_4"]
+    for name, label in (("ppo", "PPO"), ("first_order", "gradient through the simulator")):
+        stored = [r for r in over_seeds(name) if r["delay"] == "B4_4"]
         found = {(r["who"] == "ik", r["sea"]): r for r in stored}
         if not found:
             continue
@@ -85,10 +112,10 @@ def baseline() -> str:
 def controllers() -> str:
     """B4_4: everybody side by side."""
     everyone = []
-    for name in ("baseline_ik", "baseline_extrapolate", "baseline_preview"):
+    for name in CLASSICAL:
         everyone += [r for r in read(name) if r["delay"] == "B4_4"]
-    for name in ("train_2m", "first_order"):
-        trained = [r for r in read(name) if r["who"] != "ik" and r["delay"] == "B4_4"]
+    for name in ("ppo", "first_order"):
+        trained = [r for r in over_seeds(name) if r["who"] != "ik" and r["delay"] == "B4_4"]
         everyone += [{**r, "trained": r["steps"]} for r in trained]
     if not everyone:
         return "not measured yet (`python experiments/baseline.py ik extrapolate preview`)"
@@ -114,33 +141,52 @@ def controllers() -> str:
     return markdown(["B4_4", *SEAS], rows) + "\n\nSource: " + commands
 
 
-def first_order() -> str:
-    """First-order agents of all delays beside the paper's agents, both worlds."""
+def agents() -> str:
+    """Agents of all delays beside the paper's."""
     blocks = []
-    for name, world in (
-        ("first_order", "the paper's world"),
-        ("first_order_quiet", "implicitfast"),
+    for name, what in (
+        ("ppo", "PPO, the paper's world"),
+        ("first_order", "first-order, the paper's world"),
+        ("first_order_quiet", "first-order, implicitfast"),
     ):
-        cells = {(r["delay"], r["sea"]): r for r in read(name) if r["who"] != "ik"}
+        cells = {(r["delay"], r["sea"]): r for r in over_seeds(name) if r["who"] != "ik"}
         rows = []
         for delay in dict.fromkeys(delay for delay, _ in cells):
+            mine = [cells[delay, s] for s in SEAS]
             row = [delay]
             for unit in ("pos_mm", "ang_mrad"):
-                mine = [cells[delay, s] for s in SEAS]
                 row += [f"{float(r[unit]):.2f} / {r[unit + '_paper']}" for r in mine]
-            rows.append([*row, f"{float(mine[0]['train_seconds']) / 60:.1f} min"])
-        if rows:
-            header = [world, *(f"{s} mm" for s in SEAS), *(f"{s} mrad" for s in SEAS), "trained"]
-            first = next(iter(cells.values()))
-            blocks.append(markdown(header, rows) + "\n\nSource: " + source(first))
+            steps, minutes = int(mine[0]["steps"]) / 1e6, float(mine[0]["train_seconds"]) / 60
+            rows.append([*row, f"{steps:.1f} M steps, {minutes:.1f} min", mine[0]["seeds"]])
+        if not rows:
+            continue
+        header = [what, *(f"{s} mm" for s in SEAS), *(f"{s} mrad" for s in SEAS)]
+        sources = {source(r): None for r in cells.values()}
+        table = markdown([*header, "trained", "seeds"], rows)
+        blocks.append(table + "\n\nSource: " + "; ".join(sources))
         worst = [_below_paper(cell) for cell in cells.values()]
-        if rows and all(worst):
+        if all(worst):
             below = [line for lines in worst for line in lines[1:]]
-            found = f"{len(below)} of {6 * len(worst)} below the paper's: " + ", ".join(below)
-            blocks.append(
-                f"Improvements of top 5 %, top 1 % and maximum over `ik`, {world}: {found}"
-            )
-    return "\n\n".join(blocks) or "not measured yet (`python experiments/first_order.py`)"
+            found = f"{len(below)} of {6 * len(worst)} below the paper's"
+            found += ": " + ", ".join(below) if below else ""
+            blocks.append(f"Improvements of top 5 %, top 1 % and maximum over `ik`: {found}.")
+    return "\n\n".join(blocks) or "not measured yet (`python experiments/sweep.py ppo`)"
+
+
+def robust() -> str:
+    """Where the task is hard: controllers side by side."""
+    stored = read("robust")
+    if not stored:
+        return "not measured yet (`python experiments/robust.py RUN`)"
+    cells = {(r["condition"], r["who"]): r for r in stored}
+    whos = list(dict.fromkeys(r["who"] for r in stored))
+    rows = [
+        [what, *(f"{float(c['pos_mm']):.2f}, {float(c['ang_mrad']):.2f}" for c in row)]
+        for what in dict.fromkeys(r["condition"] for r in stored)
+        for row in [[cells[what, who] for who in whos]]
+    ]
+    table = markdown(["mm, mrad", *whos], rows)
+    return table + "\n\nSource: " + source(stored[0])
 
 
 def _below_paper(cell: dict[str, str]) -> list[str]:
@@ -232,7 +278,8 @@ TABLES = {
     "headline": headline,
     "baseline": baseline,
     "controllers": controllers,
-    "first_order": first_order,
+    "agents": agents,
+    "robust": robust,
     "speed": speed,
     "observation": observation,
     "presets": presets,

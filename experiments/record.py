@@ -81,5 +81,9 @@ def run_rows(run: Path) -> list[dict]:
     begun = time.monotonic()
     baseline, rows = evaluate_beside_ik(config.algo, controller, env, config.motion)
     found = evaluation_rows(baseline + rows, time.monotonic() - begun)
-    steps = {"steps": last["steps"], "train_seconds": f"{last['wall_s']:.0f}"}
+    steps = {
+        "seed": config.seed,
+        "steps": last["steps"],
+        "train_seconds": f"{last['wall_s']:.0f}",
+    }
     return [{**row, **steps, **provenance()} for row in found]

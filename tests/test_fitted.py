@@ -1,0 +1,69 @@
+"""Controllers that are fitted on training motion."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mcx_jax import fitted
+from mcx_jax.config import ConditionsConfig, EnvConfig, MotionConfig
+from mcx_jax.envs.v2v import make_env
+
+SEA = MotionConfig(sea="Wc")
+QUIET = EnvConfig(delay="E1", integrator="implicitfast", episode_steps=100)
+LEAD_STEPS = 20
+"""40 ms in physics steps."""
+
+
+@pytest.fixture(scope="module")
+def small(request):
+    """Fewer episodes to fit on: a test is no contest."""
+    patch = pytest.MonkeyPatch()
+    patch.setattr(fitted, "FIT_EPISODES", 12)
+    yield
+    patch.undo()
+
+
+def data(env, seed=9, lead=LEAD_STEPS, age=0):
+    keys = jax.random.split(jax.random.key(seed), 8)
+    x, y = fitted._regression(env, keys, jnp.int32(lead), jnp.int32(age))
+    return (np.asarray(a, np.float64).reshape(-1, a.shape[-1]) for a in (x, y))
+
+
+def rms(x):
+    return np.sqrt(np.mean(np.square(x), axis=0))
+
+
+def test_the_filter_predicts_better_than_a_straight_line(small):
+    """On test motion, fitted on training motion; lines go through the last two poses."""
+    train, test = (make_env(QUIET, SEA, split=split) for split in ("train", "test"))
+    fir = fitted.fit_fir(train, 0.002 * LEAD_STEPS)
+    x, y = data(test)
+    missed = rms(y - x @ np.asarray(fir.weights[0], np.float64))
+    last_change = x.reshape(len(x), 2, fitted.TAPS - 1, 3)[:, :, -1].reshape(-1, 6)
+    straight = rms(y - 2.0 * last_change)
+    assert np.all(missed[:3] < 0.5 * straight[:3]), (missed, straight)
+    assert np.all(missed < rms(y))
+
+
+def test_no_motion_asks_for_no_correction(small):
+    env = make_env(QUIET, SEA, split="train")
+    state = env.reset(jax.random.key(0))
+    fir = fitted.fit_fir(env, 0.03)
+    memory, action = fir.act(env, state, fir.init(env, state))
+    np.testing.assert_allclose(action, np.zeros(6), atol=1e-4)
+    assert memory.shape == (fitted.TAPS, 12)
+
+
+def test_late_measurements_have_weights_of_their_own(small):
+    late = dataclasses.replace(QUIET, conditions=ConditionsConfig(latency_steps="0:2"))
+    env = make_env(late, SEA, split="train")
+    fir = fitted.fit_fir(env, 0.002 * LEAD_STEPS)
+    assert fir.weights.shape == (3, 6 * (fitted.TAPS - 1), 6)
+    for age in range(3):
+        x, y = data(env, age=age)
+        own = rms(y - x @ np.asarray(fir.weights[age], np.float64))[:3]
+        other = rms(y - x @ np.asarray(fir.weights[(age + 1) % 3], np.float64))[:3]
+        assert np.all(own < 0.7 * other)
