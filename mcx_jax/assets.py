@@ -27,3 +27,24 @@ def asset_path(name: str) -> Path:
     raise UserError(
         f"asset {name!r} is missing: looked in {looked}; reinstall the package or check out assets/"
     )
+
+
+SHIPPED = "shipped:"
+"""`shipped:DELAY` names the trained policy for a delay that comes with the package."""
+
+
+def policy_file(who: str) -> Path:
+    """The policy file of `shipped:DELAY`, of a run directory, or of a file's name.
+
+    Raises:
+        UserError: no policy is shipped for that delay.
+    """
+    if not who.startswith(SHIPPED):
+        path = Path(who)
+        return path / "policy.npz" if path.is_dir() else path
+    folder = asset_path("policies")
+    path = folder / f"{who.removeprefix(SHIPPED)}.npz"
+    if not path.is_file():
+        names = ", ".join(sorted(f"{SHIPPED}{p.stem}" for p in folder.glob("*.npz")))
+        raise UserError(f"{who}: no such policy is shipped; use one of {names}")
+    return path

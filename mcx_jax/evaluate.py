@@ -13,6 +13,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from mcx_jax.assets import policy_file
 from mcx_jax.config import EnvConfig, MotionConfig, parse_delay
 from mcx_jax.errors import UserError
 
@@ -25,7 +26,8 @@ class EvaluateConfig:
     """Evaluate a controller on test motion that no training has seen."""
 
     who: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="WHO")]
-    """ik, extrapolate, extrapolate-best, fir, preview, a run directory, or a policy .npz file."""
+    """ik, extrapolate, extrapolate-best, fir, preview, shipped:DELAY (a trained policy that comes
+    with mcx_jax), a run directory, or a policy .npz file."""
     episodes: int = 50
     """Test episodes per sea state (paper: 50)."""
     seed: int = 0
@@ -338,12 +340,13 @@ def policy_path(who: str) -> Path | None:
     """
     if who in WHO:
         return None
-    path = Path(who)
-    if not path.exists():
+    path = policy_file(who)
+    if not path.exists() and not Path(who).is_dir():
         raise UserError(
-            f"unknown controller '{who}': use {', '.join(WHO)}, a run directory or a policy .npz"
+            f"unknown controller '{who}': use {', '.join(WHO)}, shipped:DELAY, a run directory or "
+            "a policy .npz"
         )
-    return path / "policy.npz" if path.is_dir() else path
+    return path
 
 
 def load_controller(who: str) -> tuple[str, Any]:

@@ -38,7 +38,7 @@ class ExportConfig:
     """Write a trained policy as .npz (NumPy), .onnx or .stablehlo (JAX)."""
 
     run: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="RUN")]
-    """A run directory, or a policy .npz file."""
+    """A run directory, a policy .npz file, or shipped:DELAY."""
     out: str
     """File to write; its ending says the form: .npz, .onnx or .stablehlo. Must not exist."""
 

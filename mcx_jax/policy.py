@@ -20,6 +20,7 @@ import numpy as np
 from flax import struct, traverse_util
 
 from mcx_jax import interface
+from mcx_jax.assets import policy_file
 from mcx_jax.errors import UserError
 from mcx_jax.ppo.networks import Carry, Params, PolicyNet, init_params, step
 from mcx_jax.ppo.networks import init_carry as zero_carry
@@ -144,13 +145,12 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def load_run(run: str | Path) -> Policy:
-    """The policy of a run directory, or of a policy file.
+    """The policy of a run directory, of a policy file, or of `shipped:DELAY`.
 
     Raises:
         UserError: as `load_policy`.
     """
-    path = Path(run)
-    return load_policy(path / "policy.npz" if path.is_dir() else path)
+    return load_policy(policy_file(str(run)))
 
 
 def load_policy(path: str | Path) -> Policy:

@@ -151,3 +151,15 @@ def test_episodes_that_end_within_the_warm_up_are_refused():
     assert str(error.value) == (
         "--episode-steps 50: the first 50 steps are not counted; evaluate at least 51"
     )
+
+
+def test_shipped_policies_are_there_for_the_papers_delays():
+    from mcx_jax.config import NAMED_DELAYS
+    from mcx_jax.policy import load_run
+
+    for delay in NAMED_DELAYS:
+        name, controller = load_controller(f"shipped:{delay}")
+        assert name == f"shipped:{delay}" and controller.policy.meta.action_size == 6
+        assert delay in load_run(f"shipped:{delay}").meta.interface["trained_for"]["delay"]
+    with pytest.raises(UserError, match="shipped:E0.* is shipped|no such policy is shipped.*B4_4"):
+        load_controller("shipped:E7")
