@@ -8,8 +8,8 @@
 
 Settings are those of `EnvConfig` and `MotionConfig` by name; `test=True` takes the motion that
 training never sees. Observation: (38,) float32, `envs.observe.OBS_TABLE`, m and rad. Action: (6,)
-float32, the goal moved in its own axes, 3 cm and 3 crad (rotation vector), +-10. Reward: -(dp + da)
-in m and rad. `info`: `dp_mm`, `da_mrad`, `valid`.
+float32, the goal moved in its own axes, 3 cm and 3 crad (rotation vector), within `max_correction`,
+which also the task applies. Reward: -(dp + da) in m and rad. `info`: `dp_mm`, `da_mrad`, `valid`.
 
 An episode is never terminated, only truncated, by the time limit or as soon as it is invalid (the
 IK failed, the tool is half a metre off, the arm diverged). All rewards are negative: a terminated
@@ -37,9 +37,6 @@ from mcx_jax.envs.v2v import EnvState, V2VEnv, make_env
 from mcx_jax.errors import UserError
 from mcx_jax.playground import finite_step
 
-ACTION_LIMIT = 10.0
-"""Bound of the action space, cm and crad: three times the largest error without a correction. The
-task itself does not clip."""
 ENV_ID = "mcx_jax/V2V-v0"
 
 
@@ -136,7 +133,7 @@ def _to_numpy(told: Told) -> Told:
 @cache
 def _task(env: EnvConfig, motion: MotionConfig, split: Literal["train", "test"]) -> V2VEnv:
     """Shared by all environments of a process with the same settings: the tables are large."""
-    return make_env(env, motion, split=split)
+    return make_env(env, motion, split=split).replace(whole_batches=True)  # type: ignore
 
 
 def _make_task(test: bool, settings: dict[str, Any]) -> V2VEnv:
@@ -154,9 +151,10 @@ def _make_task(test: bool, settings: dict[str, Any]) -> V2VEnv:
 
 def _spaces(env: V2VEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     """(observation, action). An observation has no bounds: any arm, any reach."""
+    bound = env.config.max_correction
     return (
         gymnasium.spaces.Box(-np.inf, np.inf, (env.obs_size,), np.float32),
-        gymnasium.spaces.Box(-ACTION_LIMIT, ACTION_LIMIT, (env.action_size,), np.float32),
+        gymnasium.spaces.Box(-bound, bound, (env.action_size,), np.float32),
     )
 
 

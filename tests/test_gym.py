@@ -67,8 +67,8 @@ def test_gymnasium_accepts_it(one):
 def test_spaces(one, many):
     assert one.observation_space.shape == (38,) and one.action_space.shape == (6,)
     assert one.observation_space.dtype == one.action_space.dtype == np.float32
-    np.testing.assert_array_equal(one.action_space.low, -10.0)
-    np.testing.assert_array_equal(one.action_space.high, 10.0)
+    np.testing.assert_array_equal(one.action_space.low, -5.0)
+    np.testing.assert_array_equal(one.action_space.high, 5.0)
     assert many.observation_space.shape == (MANY, 38) and many.action_space.shape == (MANY, 6)
     assert many.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     obs, _ = many.reset(seed=0)
