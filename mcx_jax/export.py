@@ -43,7 +43,10 @@ class ExportConfig:
     """File to write; its ending says the form: .npz, .onnx or .stablehlo. Must not exist."""
 
     def __post_init__(self) -> None:
+        from mcx_jax.cli import check_name
+
         path = Path(self.out)
+        check_name("--out", path)
         if path.suffix not in FORMS:
             raise UserError(
                 f"--out {self.out}: the ending says the form: use one of {', '.join(FORMS)}"

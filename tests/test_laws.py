@@ -98,8 +98,8 @@ def engine(name: str):
 
 @functools.cache
 def energies(name: str):
-    """(q, qd, qdd) -> (T, V), rate of T + V, sum of |power of gravity| over the joints, and the first
-    link's pose (4, 3)."""
+    """(q, qd, qdd) -> (T, V), rate of T + V, sum over the joints of the power of gravity without
+    sign, and the first link's pose (4, 3)."""
     model = arm_model(name)
 
     def one(q, qd, qdd):
@@ -368,8 +368,8 @@ WARM_RAD = {
     "float32": 1e-5,
 }
 COLD_SHARE = 0.73
-"""Measured: 74.29 % in float64 and in float32. The other postures lie behind singular ones or the
-joint limits, seen from the start pose; the task's goals do not (6 iterations are enough for all)."""
+"""Measured: 74.29 % in float64 and in float32. The others lie behind singular postures or joint
+limits, seen from the start pose; the task's goals do not (6 iterations are enough for all)."""
 
 
 def test_inverse_of_forward_from_the_start_pose_reaches_the_pose():
