@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from mcx_jax.errors import UserError
 from mcx_jax.sea import __main__ as command
 from mcx_jax.sea import tables as tables_module
 from mcx_jax.sea.hydro import VesselKnobs
