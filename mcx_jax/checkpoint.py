@@ -178,7 +178,7 @@ def _verified(folder: Path, config: str) -> dict[str, Any]:
     content = _manifest(folder)
     for name, digest in content["files"].items():
         path = folder / name
-        if not path.is_file():
+        if not os.path.isfile(path):
             raise _Refused(f"damaged: {name} is missing")
         if _digest(path) != digest:
             raise _Refused(f"damaged: {name} is not what was written")
@@ -194,7 +194,7 @@ def _manifest(folder: Path) -> dict[str, Any]:
     try:
         whole = json.loads((folder / MANIFEST).read_text())
         found, content, digest = whole["format"], whole.get("content", {}), whole.get("sha256")
-    except (OSError, ValueError, KeyError, AttributeError, TypeError):
+    except (OSError, ValueError, KeyError, AttributeError, TypeError, RecursionError):
         found, content, digest = _old_format(folder), {}, None
     if found is None:
         raise _Refused("not a checkpoint of mcx_jax, or damaged")
@@ -203,16 +203,24 @@ def _manifest(folder: Path) -> dict[str, Any]:
             f"checkpoint of format {found}; this version reads {FORMAT}; go on with the version of "
             "mcx_jax that wrote it"
         )
-    if digest != _digest_of(content):
+    if digest != _digest_of(content) or not _is_content(content):
         raise _Refused(f"damaged: {MANIFEST} is not what was written")
     return content
+
+
+def _is_content(content: Any) -> bool:
+    """Whether a manifest says what `_write_manifest` writes."""
+    wanted = {"iteration": int, "config": str, "packages": dict, "leaves": dict, "files": dict}
+    return isinstance(content, dict) and all(
+        isinstance(content.get(name), kind) for name, kind in wanted.items()
+    )
 
 
 def _old_format(folder: Path) -> Any:
     """Format of a checkpoint from before there were manifests; None: not even that."""
     try:
         return json.loads((folder / "meta" / "metadata").read_text())["format"]
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
 
 

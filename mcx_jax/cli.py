@@ -127,12 +127,24 @@ def check_output(flag: str, path: str) -> None:
     if path in ("", "-"):
         return
     target = Path(path)
+    check_name(flag, path)
     if not target.parent.is_dir():
         raise UserError(f"{flag} {path}: no such directory")
     if target.is_dir():
         raise UserError(f"{flag} {path}: is a directory; name a file")
     if not os.access(target if target.exists() else target.parent, os.W_OK):
         raise UserError(f"{flag} {path}: not writable; choose another file")
+
+
+def check_name(flag: str, path: str | Path) -> None:
+    """Refuse a path that no file can have (too long, say); whether there is one does not matter."""
+    try:
+        os.stat(path)
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise UserError(f"{flag} {path}: cannot be used ({reason}); name another") from None
 
 
 def write_output(flag: str, path: str, text: str) -> None:
@@ -161,7 +173,7 @@ def config_from_json(config_type: type[Config], text: str, where: str = "config.
     """
     try:
         values = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         raise UserError(f"{where}: not a JSON file, or cut short") from None
     if not isinstance(values, dict) or values.pop("format", None) != FORMAT:
         raise UserError(f"{where}: not a configuration of this version (format {FORMAT})")
@@ -191,7 +203,10 @@ def _value(hint: Any, value: Any, where: str) -> Any:
             raise UserError(f"{where} is {value!r}, must be one of {', '.join(get_args(hint))}")
         return value
     if hint is float and type(value) is int:
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:
+            raise UserError(f"{where} is too large a number") from None
     if type(value) is not hint:
         raise UserError(f"{where} is {value!r}, must be of type {hint.__name__}")
     return value

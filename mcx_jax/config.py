@@ -24,6 +24,9 @@ MAX_SHARDS = 64
 MAX_DELAY_S = 1.0
 """Longest delay accepted: evaluation looks that far ahead, and slower filters drift in float32."""
 
+MAX_SEED = 2**31 - 1
+"""Largest seed: 32 bits on the device."""
+
 NAMED_DELAYS = {
     "E0": "explicit:0",
     "E1": "explicit:1",
@@ -84,12 +87,12 @@ def parse_delay(text: str) -> Delay:
         UserError: unknown form, cutoff at or above Nyquist (25 Hz), order or steps out of range.
     """
     literal = NAMED_DELAYS.get(text, text)
-    if match := re.fullmatch(r"(?:explicit:|E)(\d+)", literal):
+    if match := re.fullmatch(r"(?:explicit:|E)([0-9]{1,9})", literal):
         steps = int(match[1])
         if steps > 50:
             raise UserError(f"--delay {text}: at most 50 control steps (1 s), e.g. E5")
         return Delay(name=text, steps=steps)
-    if match := re.fullmatch(r"butter:(\d+):(\d+(?:\.\d+)?)(?:Hz)?", literal):
+    if match := re.fullmatch(r"butter:([0-9]{1,9}):([0-9]+(?:\.[0-9]+)?)(?:Hz)?", literal):
         order, cutoff_hz = int(match[1]), float(match[2])
         if not 1 <= order <= 12:
             raise UserError(f"--delay {text}: the filter order must be 1 to 12")
@@ -114,6 +117,14 @@ def parse_delay(text: str) -> Delay:
 def _require(ok: bool, message: str) -> None:
     if not ok:
         raise UserError(message)
+
+
+def check_seed(seed: int, seeds: int = 1) -> None:
+    """Refuse a `--seed`, the first of `seeds`, that random numbers cannot be made from."""
+    _require(seed >= 0, f"--seed {seed}: must be 0 or a positive integer")
+    _require(
+        seed + seeds - 1 <= MAX_SEED, f"--seed {seed}: the (last) seed must be at most {MAX_SEED}"
+    )
 
 
 @dataclass(frozen=True)
@@ -419,7 +430,7 @@ class TrainConfig:
         for name in ("num_envs", "total_steps", "seeds"):
             value = getattr(self, name)
             _require(value > 0, f"--{name.replace('_', '-')} {value}: must be a positive integer")
-        _require(self.seed >= 0, f"--seed {self.seed}: must be 0 or a positive integer")
+        check_seed(self.seed, self.seeds)
         sequences = self.num_envs * (self.ppo.window_steps // self.ppo.sequence_steps)
         _require(
             sequences % self.ppo.minibatches == 0,

@@ -1,9 +1,21 @@
 """The one exception that a user's own mistake raises."""
 
+LONGEST = 1000
+"""Characters of a message; of a longer one, which quotes what it was given, the middle goes."""
+
 
 class UserError(Exception):
     """A mistake in what the user asked for.
 
     The message is one line that says what is wrong, what is allowed and what to do. The commands
-    print it without a traceback and exit with code 2 (`mcx_jax.startup.run_command`).
+    print it without a traceback and exit with code 2 (`mcx_jax.startup.run_command`). Whatever it
+    quotes, it stays one line: what cannot be printed is escaped.
     """
+
+    def __str__(self) -> str:
+        text = "".join(
+            c if c.isprintable() else c.encode("unicode_escape").decode() for c in super().__str__()
+        )
+        if len(text) <= LONGEST:
+            return text
+        return f"{text[: LONGEST // 2]} ... {text[-LONGEST // 3 :]}"

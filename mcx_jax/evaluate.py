@@ -6,15 +6,16 @@ seed gives the same motion and the same goals to everyone.
 
 import functools
 import json
+import os
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from mcx_jax.assets import policy_file
-from mcx_jax.config import EnvConfig, MotionConfig, parse_delay
+from mcx_jax.config import EnvConfig, MotionConfig, check_seed, parse_delay
 from mcx_jax.errors import UserError
 
 WHO = ("ik", "extrapolate", "extrapolate-best", "fir", "preview")
@@ -36,16 +37,15 @@ class EvaluateConfig:
     """Delay that controllers without learning are told; default the true one (the first)."""
     json: str = ""
     """Write the result as JSON to this file ('-' or no value: standard output)."""
-    device: str = "auto"
-    """auto, cpu or gpu."""
+    device: Literal["auto", "cpu", "gpu"] = "auto"
+    """Where to run; auto = GPU if JAX has one."""
     env: EnvConfig = field(default_factory=EnvConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
 
     def __post_init__(self) -> None:
         if self.episodes < 1:
             raise UserError(f"--episodes {self.episodes}: must be a positive integer")
-        if self.seed < 0:
-            raise UserError(f"--seed {self.seed}: must be 0 or a positive integer")
+        check_seed(self.seed)
         if self.known_delay:
             parse_delay(self.known_delay)
 
@@ -341,7 +341,8 @@ def policy_path(who: str) -> Path | None:
     if who in WHO:
         return None
     path = policy_file(who)
-    if not path.exists() and not Path(who).is_dir():
+    # os.path: also False where no file can have such a name.
+    if not os.path.exists(path) and not os.path.isdir(who):
         raise UserError(
             f"unknown controller '{who}': use {', '.join(WHO)}, shipped:DELAY, a run directory or "
             "a policy .npz"

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from mcx_jax import cli
 from mcx_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -44,6 +45,7 @@ class ExportConfig:
 
     def __post_init__(self) -> None:
         path = Path(self.out)
+        cli.check_name("--out", path)
         if path.suffix not in FORMS:
             raise UserError(
                 f"--out {self.out}: the ending says the form: use one of {', '.join(FORMS)}"
@@ -118,7 +120,7 @@ def interface_lines(policy: "Policy") -> list[str]:
 
 def main(argv: list[str] | None = None) -> None:
     """Command line."""
-    from mcx_jax import cli, startup
+    from mcx_jax import startup
 
     config = cli.parse(ExportConfig, sys.argv[1:] if argv is None else argv, prog="export")
     startup.configure("cpu")

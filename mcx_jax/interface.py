@@ -87,5 +87,5 @@ def _trained_for(config: str) -> dict[str, str]:
         env = json.loads(config)["env"]
         delays = [parse_delay(name).describe() for name in env["delay"].split(",")]
         return {"arm": env["arm"], "delay": "; ".join(delays)}
-    except (ValueError, KeyError, TypeError, UserError):
+    except (ValueError, KeyError, TypeError, AttributeError, UserError):
         return {}

@@ -10,7 +10,6 @@ import dataclasses
 import io
 import json
 import os
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +28,8 @@ from mcx_jax.ppo.normalise import RunningStats, init_stats, normalise_obs
 FORMAT = 1
 """Version of the file."""
 KIND = "mcx_jax policy"
+MAX_SIZE = 2**16
+"""Of an observation, an action and a layer; a file that says more is damaged."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,6 +167,8 @@ def load_policy(path: str | Path) -> Policy:
     for name, like in expected.items():
         if name not in arrays or arrays[name].shape != like.shape:
             raise UserError(f"{path}: not a whole policy file: {name} is missing or misshapen")
+        if arrays[name].dtype.kind != "f" or not np.isfinite(arrays[name]).all():
+            raise UserError(f"{path}: not a policy that can act: {name} has no finite numbers")
     weights = {tuple(n.split("/")[1:]): jnp.asarray(arrays[n]) for n in expected if "obs/" not in n}
     stats = {field: jnp.asarray(arrays[f"obs/{field}"]) for field in ("count", "mean", "var")}
     return Policy(
@@ -196,14 +199,14 @@ def _empty(meta: PolicyMeta) -> Policy:
 
 
 def _read(path: Path) -> dict[str, np.ndarray]:
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise UserError(
             f"no policy at {path}: train one (python -m mcx_jax.train), or name a policy .npz"
         )
     try:
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, KeyError, TypeError, zipfile.BadZipFile):
+    except Exception:  # a damaged zip raises nearly anything: zlib's, zipfile's, numpy's errors
         raise UserError(f"{path}: not a policy file of mcx_jax, or cut short") from None
 
 
@@ -212,13 +215,18 @@ def _meta(path: Path, text: np.ndarray | None) -> PolicyMeta:
     try:
         values = json.loads(str(text))
         kind, version = values.pop("kind"), values.pop("format")
-    except (ValueError, KeyError, AttributeError):
+    except (ValueError, KeyError, AttributeError, RecursionError):
         raise foreign from None
     if kind != KIND:
         raise foreign
     if version != FORMAT:
         raise UserError(f"{path}: policy file of format {version}; this version reads {FORMAT}")
     try:
-        return PolicyMeta(**values)
-    except TypeError:
+        meta = PolicyMeta(**values)
+        known = isinstance(json.loads(meta.config), dict)
+    except (TypeError, ValueError, RecursionError):
         raise foreign from None
+    sizes = meta.obs_size, meta.action_size, meta.hidden
+    if not known or not all(type(n) is int and 0 < n <= MAX_SIZE for n in sizes):
+        raise foreign
+    return meta

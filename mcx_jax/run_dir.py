@@ -98,9 +98,13 @@ def stored_config(path: Path) -> TrainConfig:
         UserError: there is none, or it cannot be read.
     """
     file = path / CONFIG
-    if not file.is_file():
+    if not os.path.isfile(file):
         raise UserError(f"{path}: no run to go on with here ({CONFIG} is missing)")
-    return cli.config_from_json(TrainConfig, file.read_text(), str(file))
+    try:
+        text = file.read_text("utf-8")
+    except (OSError, UnicodeDecodeError):
+        raise UserError(f"{file}: cannot be read, or is not text") from None
+    return cli.config_from_json(TrainConfig, text, str(file))
 
 
 def open_new(path: Path, config: TrainConfig) -> RunDir:
@@ -109,6 +113,7 @@ def open_new(path: Path, config: TrainConfig) -> RunDir:
     Raises:
         UserError: it holds something already.
     """
+    cli.check_name("--run-dir", path)
     if path.exists() and not path.is_dir():
         raise UserError(f"--run-dir {path}: is a file; name a directory")
     if not path.is_dir() or not any(p.name not in LEFT_OVER for p in path.iterdir()):
@@ -155,15 +160,22 @@ def _check_writable(path: Path) -> None:
 
 def _cut_metrics(path: Path, iteration: int) -> None:
     """Leave out rows after the checkpoint (and a row cut short): they will be written again."""
-    kept = []
-    for line in path.read_text().splitlines() if path.is_file() else []:
+    rows = whole_rows(path) if path.is_file() else []
+    kept = [json.dumps(row) + "\n" for row in rows if row["iteration"] <= iteration]
+    _write_whole(path, "".join(kept))
+
+
+def whole_rows(path: Path) -> list[dict[str, Any]]:
+    """The rows of metrics.jsonl, without lines that a killed process or a bad disk left."""
+    rows = []
+    for line in path.read_text("utf-8", errors="replace").splitlines():
         try:
             row = json.loads(line)
-        except ValueError:
+        except (ValueError, RecursionError):
             continue
-        if row["iteration"] <= iteration:
-            kept.append(line + "\n")
-    _write_whole(path, "".join(kept))
+        if isinstance(row, dict) and isinstance(row.get("iteration"), int):
+            rows.append(row)
+    return rows
 
 
 def _write_whole(path: Path, text: str) -> None:

@@ -48,7 +48,8 @@ CHEAP = (
 
 EXPENSIVE = (
     *("test_ik", "test_mjx_step", "test_train_command", "test_physics"),
-    *("test_ppo_trainer", "test_faults", "test_v2v", "test_killed"),
+    *("test_laws", "test_fuzz", "test_ppo_trainer", "test_faults", "test_v2v", "test_killed"),
+    "test_determinism",
 )
 """File stems that take a minute or more on two cores. Files in neither list come between."""
 

@@ -1,5 +1,7 @@
 """What is shipped: the wheel, the pinned versions, no trace of the machine it was made on."""
 
+import importlib.metadata
+import importlib.util
 import os
 import re
 import subprocess
@@ -96,12 +98,79 @@ def test_ci_runs_make_test(repo_root):
     assert "make test" in script.read_text(encoding="utf-8")
 
 
+@pytest.fixture(scope="module")
+def licences(repo_root):
+    """The module of tools/licences.py; the packages must be those that the page tells of."""
+    path = repo_root / "tools" / "licences.py"
+    spec = importlib.util.spec_from_file_location("licences", path)
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    if sys.version_info[:2] != (3, 11):
+        pytest.skip("constraints.txt, and so docs/licences.md, is made with Python 3.11")
+    return module
+
+
+def test_licences_are_current_known_and_allowed(licences, repo_root):
+    rows = licences.table()
+    assert len(rows) > 40
+    assert {"jax", "mujoco", "numpy", "scipy"} <= {row[0] for row in rows if row[3] == "runtime"}
+    for name, version, licence, _ in rows:
+        installed = importlib.metadata.version(name)
+        assert installed == version, f"{name} {installed} is installed; constraints.txt: {version}"
+        assert licence and licence != "UNKNOWN", f"{name} does not say its licence"
+        assert not DENIED.search(licence), f"{name} is under {licence}"
+    assert (repo_root / "docs" / "licences.md").read_text() == licences.page(), (
+        "run: python tools/licences.py"
+    )
+
+
+DENIED = re.compile(r"\bA?GPL|GNU (Affero )?General|proprietary|commercial", re.IGNORECASE)
+
+
+@pytest.mark.parametrize("text", ["GPL-3.0-only", "AGPL-3.0", "GNU General Public License v3"])
+def test_licences_that_would_be_refused(text):
+    assert DENIED.search(text) and not DENIED.search("LGPL-2.1") and not DENIED.search("MIT")
+
+
+def test_installed_packages_fit_together():
+    pytest.importorskip("pip", reason="this environment was made without pip")
+    said = run(sys.executable, "-m", "pip", "check", "--disable-pip-version-check", cwd=".")
+    assert said.strip() == "No broken requirements found."
+
+
+def build_wheel(root, out, epoch):
+    """Path of the wheel that hatchling builds from a source tree."""
+    pytest.importorskip("hatchling", reason="the wheel is built with hatchling, of the dev extra")
+    environment = {**os.environ, "SOURCE_DATE_EPOCH": epoch}
+    command = (sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(out))
+    run(*command, cwd=root, env=environment)
+    (wheel,) = out.glob("*.whl")
+    return wheel
+
+
+@pytest.mark.slow
+def test_wheel_is_the_same_bytes_twice(repo_root, tracked, tmp_path):
+    """From the working tree and from a copy elsewhere, whose files are younger and whose rights
+    differ."""
+    copy = tmp_path / "copy"
+    for path in tracked:
+        target = copy / path.relative_to(repo_root)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(path.read_bytes())
+        target.chmod(0o600)
+    wheels = [build_wheel(root, tmp_path / root.name, "1700000000") for root in (repo_root, copy)]
+    first, second = (wheel.read_bytes() for wheel in wheels)
+    assert first == second
+    dated = build_wheel(copy, tmp_path / "dated", "1600000000")
+    assert dated.read_bytes() != first  # the date is the one that is asked for
+    with zipfile.ZipFile(dated) as archive:
+        assert {entry.date_time[0] for entry in archive.infolist()} == {2020}
+
+
 @pytest.mark.slow
 def test_wheel_holds_the_assets_and_finds_them(repo_root, tracked, tmp_path):
-    pytest.importorskip("hatchling", reason="the wheel is built with hatchling, of the dev extra")
-    built = tmp_path / "dist"
-    run(sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(built), cwd=repo_root)
-    (wheel,) = built.glob("*.whl")
+    wheel = build_wheel(repo_root, tmp_path / "dist", "1700000000")
     unpacked = tmp_path / "site"
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(unpacked)

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from mcx_jax.errors import UserError
 from mcx_jax.sea import __main__ as command
 from mcx_jax.sea import tables as tables_module
 from mcx_jax.sea.hydro import VesselKnobs
@@ -200,15 +201,17 @@ def test_goal_never_leaves_the_reach(train):
 
 def test_command_prints_the_table_and_writes_json(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["mcx_jax.sea", "--json", str(tmp_path / "s.json")])
-    assert command.main() == 0
+    command.main()
     out = capsys.readouterr().out
     assert "mean linear speed, m/s" in out and "worst cell" in out
     figures = json.loads((tmp_path / "s.json").read_text())
     assert figures["seas"] == ["Wa", "Wb", "Wc", "Wd"]
     assert figures["worst_ratio"] < 1.15
     monkeypatch.setattr("sys.argv", ["mcx_jax.sea", "--json", str(tmp_path / "no" / "s.json")])
-    assert command.main() == 2
-    assert "cannot be written" in capsys.readouterr().err
+    with pytest.raises(UserError, match="--json .*s.json: no such directory"):
+        command.main()
+    with pytest.raises(UserError, match="unknown option --wind 3: --help lists all"):
+        command.main(["--wind", "3"])
 
 
 def test_knots_per_hour():

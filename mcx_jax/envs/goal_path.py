@@ -4,6 +4,7 @@ A path is a table of offsets, one a physics step of 2 ms, read with an integer i
 """
 
 import math
+import os
 from pathlib import Path
 
 import jax
@@ -20,6 +21,8 @@ RADIUS_M = 0.05
 CLOSED_M = 1e-3
 """A recorded path that ends this near its beginning is gone round again; others stop there."""
 MAX_FILE_S = 3600.0
+MAX_OFFSET_M = 10.0
+"""Ten times the arm's reach; beyond it a number is not in metres."""
 
 
 @struct.dataclass
@@ -65,7 +68,7 @@ def load_goal_path(name: str) -> GoalPath | None:
 
 def _from_file(name: str) -> GoalPath:
     path = Path(name)
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise UserError(
             f"--goal {name}: not static, circle or lissajous, and no such file; give a .csv file "
             "with columns t,x,y,z (s, m)"
@@ -73,8 +76,13 @@ def _from_file(name: str) -> GoalPath:
     rows = _read(name, path)
     if len(rows) < 2 or not np.isfinite(rows).all():
         raise UserError(f"--goal {name}: needs at least two rows of four finite numbers t,x,y,z")
-    time_s = rows[:, 0] - rows[0, 0]
-    if np.any(np.diff(time_s) <= 0) or time_s[-1] > MAX_FILE_S:
+    if np.abs(rows[:, 1:]).max() > MAX_OFFSET_M:
+        raise UserError(
+            f"--goal {name}: x, y, z are metres from the drawn place; at most {MAX_OFFSET_M:g}"
+        )
+    with np.errstate(over="ignore"):
+        time_s = rows[:, 0] - rows[0, 0]
+    if np.any(time_s[1:] <= time_s[:-1]) or time_s[-1] > MAX_FILE_S:
         raise UserError(f"--goal {name}: t must increase, and by at most {MAX_FILE_S:g} s")
     closed = bool(np.linalg.norm(rows[-1, 1:] - rows[0, 1:]) < CLOSED_M)
     steps = max(round(time_s[-1] / PHYSICS_DT_S), 1)

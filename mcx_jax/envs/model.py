@@ -6,6 +6,8 @@ parallel or perpendicular (nearly all) that constant is a signed permutation, wh
 vanish from the traced program.
 """
 
+import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -85,16 +87,28 @@ def load_mujoco(arm: str) -> mujoco.MjModel:
         UserError: unknown name, missing file, or a file that MuJoCo refuses.
     """
     path = asset_path(ARMS[arm]) if arm in ARMS else Path(arm)
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise UserError(
             f"--arm {arm}: not one of {', '.join(ARMS)} and no such file; "
             "give a name or an MJCF file"
         )
+    warned: list[str] = []
+    mujoco.set_mju_user_warning(warned.append)  # not into a log file in the working directory
     try:
-        return mujoco.MjModel.from_xml_path(str(path))
+        mj = mujoco.MjModel.from_xml_path(str(path))
     except (ValueError, mujoco.FatalError) as error:
         reason = " ".join(str(error).split())[:300]
         raise UserError(f"--arm {arm}: MuJoCo cannot read this model: {reason}") from None
+    finally:
+        mujoco.set_mju_user_warning(None)
+    for text in warned:
+        if "singular" in text:
+            raise UserError(
+                f"--arm {arm}: its masses or inertias cannot be simulated (MuJoCo: "
+                f"{text.split('.')[0]}); give every link some"
+            )
+        print(f"--arm {arm}: MuJoCo: {text}", file=sys.stderr)
+    return mj
 
 
 def chain_model(mj: mujoco.MjModel, tool_site: str | None = None) -> ChainModel:

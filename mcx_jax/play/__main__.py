@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from mcx_jax.config import CONTROL_DT_S, EnvConfig, MotionConfig
+from mcx_jax.config import CONTROL_DT_S, EnvConfig, MotionConfig, check_seed
 from mcx_jax.errors import UserError
 
 
@@ -42,8 +42,7 @@ class PlayConfig:
     motion: MotionConfig = field(default_factory=MotionConfig)
 
     def __post_init__(self) -> None:
-        if self.seed < 0:
-            raise UserError(f"--seed {self.seed}: must be 0 or a positive integer")
+        check_seed(self.seed)
         if not 0 <= self.episode < 50:
             raise UserError(f"--episode {self.episode}: must be 0 to 49")
         if not 1 <= self.port <= 65535:

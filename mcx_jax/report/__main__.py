@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from mcx_jax import cli
 from mcx_jax.config import EnvConfig, MotionConfig
 from mcx_jax.errors import UserError
 from mcx_jax.evaluate import EvaluateConfig
@@ -55,6 +56,7 @@ def check_out(out: str) -> Path:
     if not out:
         raise UserError("--out is missing: name a directory for the report")
     path = Path(out)
+    cli.check_name("--out", path)
     if path.exists() and not path.is_dir():
         raise UserError(f"--out {out}: is a file; name a directory")
     if path.is_dir() and any(path.iterdir()) and not _is_report(path):
@@ -69,13 +71,13 @@ def check_out(out: str) -> Path:
 def _is_report(path: Path) -> bool:
     try:
         return json.loads((path / RESULTS).read_text())["kind"] == KIND
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return False
 
 
 def main(argv: list[str] | None = None) -> None:
     """Command line."""
-    from mcx_jax import cli, startup
+    from mcx_jax import startup
     from mcx_jax.report import entries
 
     argv = list(sys.argv[1:] if argv is None else argv)

@@ -11,11 +11,15 @@ import numpy as np
 from mcx_jax import cli
 from mcx_jax.errors import UserError
 from mcx_jax.evaluate import load_controller, policy_path
-from mcx_jax.run_dir import METRICS
+from mcx_jax.run_dir import METRICS, whole_rows
 
 OWN_SETTINGS = ("delay", "arm", "tool_site", "integrator")
 """What a policy was trained for and is reported in, unless the command line says otherwise. Not
 `physics`: both engines are the same task."""
+
+
+COLUMNS = ("seed", "steps", "wall_s", "pos_error_mm", "ang_error_mrad")
+"""Of metrics.jsonl, what learning curves are made of."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +76,9 @@ def _load(who: str) -> Entry:
     path = policy_path(who)
     if path is None:
         return Entry(who, who, controller, {}, learned=False, run=None)
-    stored = json.loads(controller.policy.meta.config).get("env", {})
-    settings = {name: stored[name] for name in OWN_SETTINGS if name in stored}
+    stored = json.loads(controller.policy.meta.config).get("env")
+    stored = stored if isinstance(stored, dict) else {}
+    settings = {k: v for k, v in stored.items() if k in OWN_SETTINGS and isinstance(v, str)}
     run = path.parent if (path.parent / METRICS).is_file() else None
     return Entry(who, who, controller, settings, learned=True, run=run)
 
@@ -111,12 +116,9 @@ def common_settings(entries: Sequence[Entry], argv: Sequence[str]) -> dict[str, 
 def learning_curves(run: Path) -> Curves | None:
     """metrics.jsonl as arrays, as far as every seed has come; None if there is not one row."""
     rows: dict[int, list[dict[str, Any]]] = {}
-    for line in (run / METRICS).read_text().splitlines():
-        try:
-            row = json.loads(line)
-        except ValueError:  # the last line of a run that was killed
-            continue
-        rows.setdefault(row["seed"], []).append(row)
+    for row in whole_rows(run / METRICS):
+        if all(isinstance(row.get(name), int | float) for name in COLUMNS):
+            rows.setdefault(row["seed"], []).append(row)
     count = min((len(part) for part in rows.values()), default=0)
     if not count:
         return None

@@ -1,13 +1,11 @@
 """`python -m mcx_jax.sea`: motion statistics of the generator beside the paper's table 1."""
 
-import argparse
 import json
 import math
-import pathlib
 import sys
+from dataclasses import dataclass
 
 from mcx_jax import cli
-from mcx_jax.errors import UserError
 from mcx_jax.sea.spectrum import SEAS
 from mcx_jax.sea.statistics import (
     WANTED_ANGULAR_RAD_S,
@@ -16,6 +14,14 @@ from mcx_jax.sea.statistics import (
     goal_speed,
 )
 from mcx_jax.sea.tables import build_tables
+
+
+@dataclass(frozen=True)
+class SeaConfig:
+    """Motion statistics of the generator beside the paper's table 1."""
+
+    json: str = ""
+    """Also write the figures to this file."""
 
 
 def report(speed: GoalSpeed) -> dict:
@@ -49,21 +55,18 @@ def lines(figures: dict) -> list[str]:
     return text
 
 
-def main() -> int:
+def main(argv: list[str] | None = None) -> None:
     """Print the statistics of the chosen calibration; 8 hours of motion per sea state."""
-    parser = argparse.ArgumentParser(prog="python -m mcx_jax.sea", description=main.__doc__)
-    parser.add_argument("--json", type=pathlib.Path, help="also write the figures to this file")
-    args = parser.parse_args()
-    try:
-        figures = report(goal_speed(build_tables(list(SEAS.values()), "train")))
-        print("\n".join(lines(figures)))
-        if args.json:
-            cli.write_output("--json", str(args.json), json.dumps(figures, indent=1) + "\n")
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    argv = list(sys.argv[1:] if argv is None else argv)
+    config = cli.parse(SeaConfig, argv, prog="sea")
+    cli.check_output("--json", config.json)
+    figures = report(goal_speed(build_tables(list(SEAS.values()), "train")))
+    print("\n".join(lines(figures)))
+    if config.json:
+        cli.write_output("--json", config.json, json.dumps(figures, indent=1) + "\n")
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from mcx_jax.startup import run_command
+
+    run_command(main)
