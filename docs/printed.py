@@ -66,7 +66,7 @@ def command_line(command: str) -> str:
 
 
 def printed(command: str) -> str:
-    """What a command prints, errors included, but for the line that depends on the cores."""
+    """What a command prints, errors included."""
     module, *words = shlex.split(command)
     variables = {"COLUMNS": COLUMNS, "PYTHONPATH": str(ROOT), "TERM": "dumb", "NO_COLOR": "1"}
     with tempfile.TemporaryDirectory() as folder:
@@ -82,7 +82,12 @@ def printed(command: str) -> str:
         )
     if done.returncode not in (0, 2) or "Traceback" in done.stdout:
         raise SystemExit(f"{command}: exit code {done.returncode}\n{done.stdout}")
-    lines = [line.rstrip() for line in done.stdout.strip().splitlines()]
+    return tidied(done.stdout)
+
+
+def tidied(text: str) -> str:
+    """Without spaces at line ends and the line that depends on the number of cores."""
+    lines = [line.rstrip() for line in text.strip().splitlines()]
     return "\n".join(line for line in lines if not line.startswith("XLA_FLAGS += "))
 
 
