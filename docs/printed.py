@@ -54,8 +54,6 @@ SLOW = {
     "policy-e1": f"{POLICY} E1 --sea Wd",
     "policy-e2": f"{POLICY} E2 --sea Wd",
     "export": "export runs/B4_4-first-order-s0 --out policy.npz",
-    "report": "report extrapolate --sea Wd --episodes 8 --out report",
-    "frame": "play extrapolate --frame picture.png --at 12.5",
 }
 """These compute; `runs` must hold what they name."""
 
