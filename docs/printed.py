@@ -55,7 +55,7 @@ SLOW = {
     "policy-e2": f"{POLICY} E2 --sea Wd",
     "export": "export runs/B4_4-first-order-s0 --out policy.npz",
 }
-"""These compute; `runs` must hold what they name."""
+"""These compute; `runs` must hold what they name (docs/commands.md says how it was trained)."""
 
 
 def command_line(command: str) -> str:
