@@ -13,7 +13,7 @@ VENV := .venv
 PY   := $(VENV)/bin/python
 PIP  := $(PY) -m pip install --disable-pip-version-check --progress-bar off -c constraints.txt
 
-.PHONY: help train bench test check format clean
+.PHONY: help train bench test check format docs clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -40,8 +40,12 @@ format: $(VENV)/.dev  ## mend what ruff can mend
 	$(PY) -m ruff check --fix .
 	$(PY) -m ruff format .
 
+docs: $(VENV)/.dev  ## the site, into site/index.html
+	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --quiet
+	@echo "done: site/index.html"
+
 clean:  ## remove caches and build products; keeps .venv and runs/
-	rm -rf build dist .pytest_cache .ruff_cache .hypothesis *.egg-info MUJOCO_LOG.TXT
+	rm -rf build dist site .pytest_cache .ruff_cache .hypothesis *.egg-info MUJOCO_LOG.TXT
 	find mcx_jax tests tools experiments -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(VENV)/bin/python:
