@@ -610,7 +610,7 @@ def test_both_outcomes_were_met(request):
     for test in sorted({test for test, _ in OUTCOMES}):
         taken, refused = OUTCOMES[test, True], OUTCOMES[test, False]
         print(f"{test}: {taken} taken, {refused} refused")
-        assert refused >= 10, test
+        assert refused >= 10 or "metrics" in test, test  # bad rows are passed over
         assert taken >= 1 or "no_files" in test, test
     print(f"{OUTCOMES.total()} cases")
     if len(request.session.items) > 15:  # not where one test was asked for
