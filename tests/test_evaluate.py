@@ -120,8 +120,8 @@ def test_a_wrong_who_is_one_line():
     done = command("nobody", "--delay", "E0")
     assert done.returncode == 2
     assert done.stderr.splitlines()[-1] == (
-        "error: unknown controller 'nobody': use ik, extrapolate, preview, a run directory or a "
-        "policy .npz"
+        "error: unknown controller 'nobody': use ik, extrapolate, extrapolate-best, fir, preview, "
+        "a run directory or a policy .npz"
     )
     assert "Traceback" not in done.stderr
 

@@ -334,7 +334,7 @@ def number_tables(draw, columns: int, rows: int):
     """A good table with some strange numbers and a column too many or too few now and then."""
     columns += draw(st.sampled_from([0, 0, 0, 0, -1, 1]))
     rows = draw(st.sampled_from([0, 1, 2, rows, rows]))
-    step_s = draw(st.sampled_from([0.01, 0.1, 1e-3, 1e3, 0.0, -0.1, 1e300, 5e-324]))
+    step_s = draw(st.sampled_from([0.1, 0.1, 0.1, 1e-3, 1e3, 0.0, -0.1, 1e300, 5e-324]))
     data = np.zeros((rows, columns))
     data[:, 0] = step_s * np.arange(rows)
     for _ in range(draw(st.integers(0, 3)) if data.size else 0):
@@ -384,7 +384,7 @@ GOOD_NPY = npy(np.column_stack([np.arange(1300) * 0.1, np.zeros((1300, 6))]))
 @given(
     content=st.one_of(
         st.tuples(st.just(".csv"), st.one_of(TABLES, number_tables(7, 1300).map(csv))),
-        st.tuples(st.just(".npy"), st.one_of(st.binary(max_size=200), damaged(GOOD_NPY[:200]))),
+        st.tuples(st.just(".npy"), st.one_of(st.binary(max_size=200), damaged(GOOD_NPY))),
         st.tuples(st.just(".npy"), number_tables(7, 1300).map(npy)),
         st.tuples(
             st.just(".npy"),
@@ -396,6 +396,7 @@ GOOD_NPY = npy(np.column_stack([np.arange(1300) * 0.1, np.zeros((1300, 6))]))
     scale=st.one_of(st.just(1.0), st.floats()),
 )
 @example(content=(".npy", npy(np.full((1300, 7), 1e308))), scale=1.0)
+@example(content=(".npy", GOOD_NPY), scale=1.0)
 @example(content=(".npy", GOOD_NPY), scale=5e-324)
 @example(content=(".npy", GOOD_NPY), scale=1e308)
 @example(
@@ -610,7 +611,8 @@ def test_both_outcomes_were_met(request):
     for test in sorted({test for test, _ in OUTCOMES}):
         taken, refused = OUTCOMES[test, True], OUTCOMES[test, False]
         print(f"{test}: {taken} taken, {refused} refused")
-        assert taken >= 1 and refused >= 10, test
+        assert refused >= 10 or "metrics" in test, test  # bad rows are passed over
+        assert taken >= 1 or "no_files" in test, test
     print(f"{OUTCOMES.total()} cases")
     if len(request.session.items) > 15:  # not where one test was asked for
         assert OUTCOMES.total() >= 2000

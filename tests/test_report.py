@@ -186,8 +186,8 @@ def test_refusals(made, tmp_path):
     out = str(tmp_path / "out")
     refused(
         ["nobody", "--out", out],
-        "unknown controller 'nobody': use ik, extrapolate, preview, a run directory or a policy "
-        ".npz",
+        "unknown controller 'nobody': use ik, extrapolate, extrapolate-best, fir, "
+        "preview, a run directory or a policy .npz",
     )
     refused(
         ["--out", out],
