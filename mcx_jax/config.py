@@ -35,7 +35,7 @@ NAMED_DELAYS = {
     "B4_4": "butter:4:10.4Hz",
 }
 """The five delays of the paper's table 2. "B(4,4)" is an erratum of the paper: 4 Hz would delay by
-98 ms; the authors' code has 0.416 of Nyquist = 10.4 Hz, 34 ms, and only that fits table 3."""
+102 ms; the authors' code has 0.416 of Nyquist = 10.4 Hz, 34 ms, and only that fits table 3."""
 
 
 @dataclass(frozen=True)
