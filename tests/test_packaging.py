@@ -192,3 +192,24 @@ def test_wheel_holds_the_assets_and_finds_them(repo_root, tracked, tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(unpacked)}
     said = run(sys.executable, "-c", code, cwd=tmp_path, env=environment)
     assert said.split() == [str(unpacked / "mcx_jax" / "_assets" / "ur10e_paper.xml"), "12"]
+
+
+def test_the_slurm_script_starts_25_different_agents(repo_root, tmp_path, monkeypatch):
+    """With `echo` for Python: the lines that Slurm's tasks would run, parsed by the command."""
+    from mcx_jax.train import read_command
+
+    monkeypatch.chdir(tmp_path)
+    runs = set()
+    for task in range(25):
+        said = subprocess.run(
+            ["bash", str(repo_root / "tools" / "sweep.sbatch")],
+            env={"SLURM_ARRAY_TASK_ID": str(task), "PYTHON": "echo", "PATH": os.environ["PATH"]},
+            capture_output=True,
+            text=True,
+            check=True,
+            cwd=tmp_path,
+        ).stdout.split()
+        assert said[:2] == ["-m", "mcx_jax.train"]
+        command, run = read_command(said[2:])
+        runs.add((command.train.env.delay, command.train.seed, str(run.path)))
+    assert len(runs) == 25 and len({run for *_, run in runs}) == 25
