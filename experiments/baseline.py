@@ -13,7 +13,8 @@ import time
 from record import evaluation_rows, provenance, write_rows
 
 from mcx_jax import startup
-from mcx_jax.config import NAMED_DELAYS, EnvConfig, MotionConfig
+from mcx_jax.delay import NAMED_DELAYS
+from mcx_jax.env_config import EnvConfig, MotionConfig
 
 
 def main() -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from mcx_jax import startup
-from mcx_jax.config import EnvConfig, MotionConfig
+from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.play import gl
 
 EPISODE, AT_S = 0, 12.5

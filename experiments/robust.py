@@ -20,8 +20,8 @@ import numpy as np
 from record import provenance, write_rows
 
 from mcx_jax import startup
-from mcx_jax.config import ConditionsConfig, EnvConfig, MotionConfig
 from mcx_jax.controllers import CLASSICAL
+from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
 from mcx_jax.envs.conditions import Conditions, Noise
 from mcx_jax.envs.plant import Plant
 from mcx_jax.envs.v2v import make_env

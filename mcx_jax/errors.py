@@ -19,3 +19,9 @@ class UserError(Exception):
         if len(text) <= LONGEST:
             return text
         return f"{text[: LONGEST // 2]} ... {text[-LONGEST // 3 :]}"
+
+
+def require(ok: bool, message: str) -> None:
+    """Raise a UserError with `message` unless `ok`."""
+    if not ok:
+        raise UserError(message)

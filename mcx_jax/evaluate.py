@@ -15,7 +15,9 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from mcx_jax.assets import policy_file
-from mcx_jax.config import EnvConfig, MotionConfig, check_seed, parse_delay
+from mcx_jax.config import check_seed
+from mcx_jax.delay import parse_delay
+from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.errors import UserError
 
 WHO = ("ik", "extrapolate", "extrapolate-best", "fir", "preview")

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from mcx_jax.config import CONTROL_DT_S, PHYSICS_DT_S, SUBSTEPS
 from mcx_jax.controllers import HOLD_LEAD_S, Extrapolate, correction
+from mcx_jax.delay import CONTROL_DT_S, PHYSICS_DT_S, SUBSTEPS
 from mcx_jax.envs import conditions
 from mcx_jax.envs.v2v import EnvState, V2VEnv
 from mcx_jax.spatial import (

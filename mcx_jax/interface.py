@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 
-from mcx_jax.config import CONTROL_DT_S, parse_delay
+from mcx_jax.delay import CONTROL_DT_S, parse_delay
 from mcx_jax.envs.observe import AGE, OBS_SIZE, OBS_TABLE, ObservationRow
 from mcx_jax.errors import UserError
 from mcx_jax.ppo.networks import PolicyNet, init_carry

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from mcx_jax.config import CONTROL_DT_S
+from mcx_jax.delay import CONTROL_DT_S
 from mcx_jax.errors import UserError
 from mcx_jax.paper import table3
 

@@ -30,7 +30,8 @@ import orbax.checkpoint  # noqa: E402, F401
 from probe_envs import make_probe  # noqa: E402
 
 from mcx_jax import checkpoint, divergence  # noqa: E402, F401
-from mcx_jax.config import EnvConfig, preset_config  # noqa: E402
+from mcx_jax.config import preset_config  # noqa: E402
+from mcx_jax.env_config import EnvConfig  # noqa: E402
 from mcx_jax.policy import load_policy, named_arrays  # noqa: E402
 from mcx_jax.programs import prepare  # noqa: E402
 from mcx_jax.progress import Progress  # noqa: E402

@@ -26,8 +26,8 @@ from test_first_order import CONFIG as FIRST_ORDER
 from test_ppo_trainer import CONFIG as PPO
 
 from mcx_jax import checkpoint
-from mcx_jax.config import EnvConfig, MotionConfig
 from mcx_jax.controllers import CLASSICAL
+from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.evaluate import errors_beside_ik, evaluation_env, rows_beside_ik
 from mcx_jax.programs import prepare
 

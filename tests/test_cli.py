@@ -8,7 +8,8 @@ from dataclasses import replace
 import pytest
 
 from mcx_jax import cli
-from mcx_jax.config import EnvConfig, TrainConfig, preset_config
+from mcx_jax.config import TrainConfig, preset_config
+from mcx_jax.env_config import EnvConfig
 from mcx_jax.errors import UserError
 
 

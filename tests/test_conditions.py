@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from mcx_jax.config import ConditionsConfig, EnvConfig, MotionConfig, Range
+from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig, Range
 from mcx_jax.envs import chain, conditions
 from mcx_jax.envs.goal_path import PERIOD_S, RADIUS_M, load_goal_path
 from mcx_jax.envs.model import chain_model

@@ -3,6 +3,7 @@ knobs."""
 
 import ast
 import dataclasses
+import inspect
 import itertools
 import math
 import re
@@ -14,19 +15,17 @@ import pytest
 from scipy.signal import butter, group_delay
 
 import mcx_jax
-from mcx_jax import config
-from mcx_jax.config import (
+from mcx_jax.config import FirstOrderConfig, PPOConfig, TrainConfig, preset_config
+from mcx_jax.delay import (
+    CONTROL_DT_S,
     NAMED_DELAYS,
-    ConditionsConfig,
+    NYQUIST_HZ,
+    PHYSICS_DT_S,
+    SUBSTEPS,
     Delay,
-    EnvConfig,
-    FirstOrderConfig,
-    MotionConfig,
-    PPOConfig,
-    TrainConfig,
     parse_delay,
-    preset_config,
 )
+from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
 from mcx_jax.errors import UserError
 
 KNOWN = (
@@ -61,10 +60,10 @@ def test_delay_names_and_literals(text, want):
 
 
 def test_the_papers_cutoffs_as_shares_of_nyquist():
-    assert config.NYQUIST_HZ == 25.0
+    assert NYQUIST_HZ == 25.0
     # Authors' code: 0.832 and 0.416 of Nyquist; 0.832 * 25 = 20.8, 0.416 * 25 = 10.4.
-    assert parse_delay("B4_21").cutoff_hz / config.NYQUIST_HZ == pytest.approx(0.832)
-    assert parse_delay("B4_4").cutoff_hz / config.NYQUIST_HZ == pytest.approx(0.416)
+    assert parse_delay("B4_21").cutoff_hz / NYQUIST_HZ == pytest.approx(0.832)
+    assert parse_delay("B4_4").cutoff_hz / NYQUIST_HZ == pytest.approx(0.416)
 
 
 @pytest.mark.parametrize(
@@ -237,7 +236,8 @@ def test_paper_preset_is_the_papers_schedule():
         "minibatches": 1,
         "gamma": 0.99,
         "gae_lambda": 0.97,
-        "clip": 0.15,
+        "hidden": 128,
+        "cell": "lstm",
         "entropy_coef": 0.01,
         "target_kl": 0.01,
         "policy_lr": 1e-4,
@@ -269,8 +269,8 @@ def test_defaults_are_the_papers_task():
     env = EnvConfig()
     assert (env.delay, env.arm, env.physics, env.integrator) == ("B4_4", "paper", "chain", "model")
     assert env.episode_steps == 1000
-    assert (config.PHYSICS_DT_S, config.SUBSTEPS) == (0.002, 10)
-    assert config.CONTROL_DT_S == pytest.approx(0.02, rel=1e-15)
+    assert (PHYSICS_DT_S, SUBSTEPS) == (0.002, 10)
+    assert CONTROL_DT_S == pytest.approx(0.02, rel=1e-15)
     assert MotionConfig().sea == "all"
 
 
@@ -323,7 +323,7 @@ def test_every_setting_is_read_somewhere(cls):
 @pytest.mark.parametrize("cls", ALL_CONFIGS)
 def test_every_setting_has_a_sentence(cls):
     """The command line's help is the string below each field."""
-    tree = dict(_package_trees())["config.py"]
+    tree = dict(_package_trees())[Path(inspect.getfile(cls)).name]
     body = next(n for n in tree.body if isinstance(n, ast.ClassDef) and n.name == cls.__name__).body
     described = {
         node.target.id

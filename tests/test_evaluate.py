@@ -9,8 +9,8 @@ import sys
 import numpy as np
 import pytest
 
-from mcx_jax.config import EnvConfig, MotionConfig
 from mcx_jax.controllers import CLASSICAL
+from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.errors import UserError
 from mcx_jax.evaluate import EvaluateConfig, evaluate, load_controller, print_table
 from mcx_jax.results import GROUPS
@@ -154,7 +154,7 @@ def test_episodes_that_end_within_the_warm_up_are_refused():
 
 
 def test_shipped_policies_are_there_for_the_papers_delays():
-    from mcx_jax.config import NAMED_DELAYS
+    from mcx_jax.delay import NAMED_DELAYS
     from mcx_jax.policy import load_run
 
     for delay in NAMED_DELAYS:

@@ -19,7 +19,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mcx_jax import cli, numpy_policy
-from mcx_jax.config import EnvConfig, MotionConfig, TrainConfig
+from mcx_jax.config import TrainConfig
+from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.envs import observe
 from mcx_jax.envs.motion import draw_track
 from mcx_jax.envs.v2v import correct, make_env

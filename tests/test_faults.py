@@ -14,7 +14,8 @@ from test_first_order import CONFIG as FIRST_ORDER
 from test_ppo_trainer import CONFIG as PPO
 
 from mcx_jax import checkpoint, divergence
-from mcx_jax.config import EnvConfig, TrainConfig
+from mcx_jax.config import TrainConfig
+from mcx_jax.env_config import EnvConfig
 from mcx_jax.errors import UserError
 from mcx_jax.ppo.rollout import replace_broken
 from mcx_jax.programs import Training, prepare

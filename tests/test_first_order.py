@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from probe_envs import make_probe
 
-from mcx_jax.config import EnvConfig, FirstOrderConfig, TrainConfig, preset_config
+from mcx_jax.config import FirstOrderConfig, TrainConfig, preset_config
+from mcx_jax.env_config import EnvConfig
 from mcx_jax.errors import UserError
 from mcx_jax.first_order import trainer
 from mcx_jax.programs import prepare

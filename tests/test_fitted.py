@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mcx_jax import fitted
-from mcx_jax.config import ConditionsConfig, EnvConfig, MotionConfig
+from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
 from mcx_jax.envs.v2v import make_env
 
 SEA = MotionConfig(sea="Wc")

@@ -22,7 +22,9 @@ from hypothesis import strategies as st
 
 from mcx_jax import checkpoint, cli, evaluate, export, startup, train
 from mcx_jax.bench import __main__ as bench_command
-from mcx_jax.config import EnvConfig, TrainConfig, parse_delay, parse_range, preset_config
+from mcx_jax.config import TrainConfig, preset_config
+from mcx_jax.delay import parse_delay
+from mcx_jax.env_config import EnvConfig, parse_range
 from mcx_jax.envs.goal_path import load_goal_path
 from mcx_jax.envs.model import ARMS, chain_model, load_mujoco
 from mcx_jax.envs.v2v import _check_arm

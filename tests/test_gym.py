@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from mcx_jax import gym
-from mcx_jax.config import EnvConfig, MotionConfig
+from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.envs.v2v import make_env
 from mcx_jax.errors import UserError
 

@@ -10,7 +10,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from scipy.signal import butter, sosfilt, sosfilt_zi
 
-from mcx_jax.config import CONTROL_DT_S, NYQUIST_HZ, Delay, parse_delay
+from mcx_jax.delay import CONTROL_DT_S, NYQUIST_HZ, Delay, parse_delay
 from mcx_jax.envs import lag
 
 JOINTS = 6

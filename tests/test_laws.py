@@ -13,7 +13,7 @@ import pytest
 from scipy.signal import butter, sosfilt, sosfilt_zi
 from scipy.spatial.transform import Rotation
 
-from mcx_jax.config import MAX_DELAY_S, NYQUIST_HZ, Delay
+from mcx_jax.delay import MAX_DELAY_S, NYQUIST_HZ, Delay
 from mcx_jax.envs import chain, dynamics, ik, lag, vessels
 from mcx_jax.envs.model import chain_model, load_mujoco
 from mcx_jax.envs.v2v import START_POSE_RAD

@@ -15,8 +15,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from mcx_jax.config import SUBSTEPS, EnvConfig, MotionConfig
 from mcx_jax.controllers import CLASSICAL
+from mcx_jax.delay import SUBSTEPS
+from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.envs import ik, vessels
 from mcx_jax.envs.motion import Track
 from mcx_jax.envs.v2v import make_env

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcx_jax.config import EnvConfig, MotionConfig
+from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.playground import V2V, State
 
 STEPS = 10

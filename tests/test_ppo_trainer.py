@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from probe_envs import make_probe
 
-from mcx_jax.config import EnvConfig, PPOConfig, TrainConfig
+from mcx_jax.config import PPOConfig, TrainConfig
+from mcx_jax.env_config import EnvConfig
 from mcx_jax.ppo import trainer
 from mcx_jax.ppo.networks import init_carry, init_params, step
 from mcx_jax.ppo.normalise import RunningStats, denormalise

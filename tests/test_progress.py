@@ -12,7 +12,8 @@ from probe_envs import make_probe
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 
 from mcx_jax import startup
-from mcx_jax.config import EnvConfig, MotionConfig, preset_config
+from mcx_jax.config import preset_config
+from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.progress import Progress, references
 from mcx_jax.results import paper_means
 from mcx_jax.run_dir import open_existing, open_new

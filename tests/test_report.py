@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from mcx_jax import cli
-from mcx_jax.config import EnvConfig, MotionConfig, TrainConfig
+from mcx_jax.config import TrainConfig
+from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.envs.model import torque_limits_nm
 from mcx_jax.errors import UserError
 from mcx_jax.evaluate import (

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcx_jax.config import EnvConfig, PPOConfig, TrainConfig, preset_config
+from mcx_jax.config import PPOConfig, TrainConfig, preset_config
+from mcx_jax.env_config import EnvConfig
 from mcx_jax.sharding import ENV_AXIS, env_mesh, over_envs, put
 
 RUN = """

@@ -17,7 +17,8 @@ import pytest
 from probe_envs import make_probe
 
 from mcx_jax import checkpoint, cli, startup
-from mcx_jax.config import EnvConfig, TrainConfig, preset_config
+from mcx_jax.config import TrainConfig, preset_config
+from mcx_jax.env_config import EnvConfig
 from mcx_jax.errors import UserError
 from mcx_jax.policy import load_policy
 from mcx_jax.programs import prepare

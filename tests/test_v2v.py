@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mcx_jax.config import CONTROL_DT_S, PHYSICS_DT_S, SUBSTEPS, EnvConfig, MotionConfig
 from mcx_jax.controllers import IK, Extrapolate, Preview
+from mcx_jax.delay import CONTROL_DT_S, PHYSICS_DT_S, SUBSTEPS
+from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.envs import chain, ik, lag, observe, vessels
 from mcx_jax.envs.model import load_mujoco
 from mcx_jax.envs.motion import LOOK_AHEAD_STEPS, draw_track, load_motion

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from mcx_jax.bench.timing import median_s
-from mcx_jax.config import SUBSTEPS
+from mcx_jax.delay import SUBSTEPS
 from mcx_jax.envs import chain
 from mcx_jax.envs.model import ChainModel, chain_model, load_mujoco
 from mcx_jax.sharding import env_mesh, put

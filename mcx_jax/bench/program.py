@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from mcx_jax.bench.timing import median_s
-from mcx_jax.config import CONTROL_DT_S, SUBSTEPS, TrainConfig
+from mcx_jax.config import TrainConfig
+from mcx_jax.delay import CONTROL_DT_S, SUBSTEPS
 from mcx_jax.envs import ik, lag, observe, vessels
 from mcx_jax.envs.v2v import ArmState, EnvState, V2VEnv
 from mcx_jax.ppo import rollout, trainer

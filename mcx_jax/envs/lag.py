@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from mcx_jax.config import NYQUIST_HZ, Delay
+from mcx_jax.delay import NYQUIST_HZ, Delay
 
 
 @struct.dataclass

@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mcx_jax.config import CONTROL_DT_S, SUBSTEPS, MotionConfig
+from mcx_jax.delay import CONTROL_DT_S, SUBSTEPS
+from mcx_jax.env_config import MotionConfig
 from mcx_jax.errors import UserError
 from mcx_jax.sea.sampler import KNOT_STEPS
 

@@ -13,7 +13,8 @@ from flax import struct
 from mujoco import MjModel
 
 from mcx_jax.batch_last import batch_last
-from mcx_jax.config import CONTROL_DT_S, PHYSICS_DT_S, SUBSTEPS, Delay, EnvConfig, MotionConfig
+from mcx_jax.delay import CONTROL_DT_S, PHYSICS_DT_S, SUBSTEPS, Delay
+from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.envs import chain, conditions, ik, lag, observe, vessels
 from mcx_jax.envs.conditions import Conditions, Measurement
 from mcx_jax.envs.goal_path import GoalPath, load_goal_path

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mcx_jax.config import SUBSTEPS
+from mcx_jax.delay import SUBSTEPS
 from mcx_jax.envs.motion import Motion, Track
 from mcx_jax.sea.sampler import KNOT_STEPS, body_rates, hermite, segment_rows
 from mcx_jax.spatial import (

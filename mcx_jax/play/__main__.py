@@ -12,7 +12,9 @@ from typing import Annotated, Literal
 
 import tyro
 
-from mcx_jax.config import CONTROL_DT_S, EnvConfig, MotionConfig, check_seed
+from mcx_jax.config import check_seed
+from mcx_jax.delay import CONTROL_DT_S
+from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.errors import UserError
 
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import viser
 
-from mcx_jax.config import CONTROL_DT_S, parse_delay
 from mcx_jax.controllers import CLASSICAL
+from mcx_jax.delay import CONTROL_DT_S, parse_delay
 from mcx_jax.envs.v2v import V2VEnv, make_env
 from mcx_jax.errors import UserError
 from mcx_jax.play.episode import EPISODES, Take, simulate

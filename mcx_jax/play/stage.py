@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from mcx_jax.assets import asset_path
-from mcx_jax.config import EnvConfig
+from mcx_jax.env_config import EnvConfig
 from mcx_jax.envs.model import ARMS
 from mcx_jax.play.episode import Poses
 from mcx_jax.play.waves import Surface

@@ -9,7 +9,8 @@ from typing import IO
 
 import numpy as np
 
-from mcx_jax.config import CONTROL_DT_S, EnvConfig, MotionConfig
+from mcx_jax.delay import CONTROL_DT_S
+from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.errors import UserError
 from mcx_jax.play.episode import Take
 from mcx_jax.play.picture import HEIGHT_PX, WIDTH_PX, Picture

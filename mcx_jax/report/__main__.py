@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from mcx_jax import cli
-from mcx_jax.config import EnvConfig, MotionConfig
+from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.errors import UserError
 from mcx_jax.evaluate import EvaluateConfig
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mcx_jax import machine
-from mcx_jax.config import CONTROL_DT_S
+from mcx_jax.delay import CONTROL_DT_S
 from mcx_jax.envs.model import torque_limits_nm
 from mcx_jax.evaluate import (
     Errors,

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from mcx_jax.config import CONTROL_DT_S
+from mcx_jax.delay import CONTROL_DT_S
 from mcx_jax.envs import ik
 from mcx_jax.envs.v2v import EnvState, V2VEnv
 from mcx_jax.spatial import unpack

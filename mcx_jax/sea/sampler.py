@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 
-from mcx_jax.config import PHYSICS_DT_S
+from mcx_jax.delay import PHYSICS_DT_S
 from mcx_jax.sea.tables import KNOT_DT_S, KNOT_STEPS
 from mcx_jax.spatial import Scalar, Vec
 from mcx_jax.stage import stage

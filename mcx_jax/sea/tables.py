@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from mcx_jax.config import PHYSICS_DT_S
+from mcx_jax.delay import PHYSICS_DT_S
 from mcx_jax.sea.hydro import VesselKnobs, load_hydro, motion_rao
 from mcx_jax.sea.spectrum import GRAVITY_M_S2, SeaState, jonswap, spreading_weights
 
