@@ -236,8 +236,7 @@ def test_paper_preset_is_the_papers_schedule():
         "minibatches": 1,
         "gamma": 0.99,
         "gae_lambda": 0.97,
-        "hidden": 128,
-        "cell": "lstm",
+        "clip": 0.15,
         "entropy_coef": 0.01,
         "target_kl": 0.01,
         "policy_lr": 1e-4,
@@ -246,6 +245,7 @@ def test_paper_preset_is_the_papers_schedule():
         "max_grad_norm": 0.0,
         "value_target": "discounted",
         "hidden": 128,
+        "cell": "lstm",
         "reject_mean_sq_reward": 0.008,
     }
     got = dataclasses.asdict(paper.ppo)
