@@ -19,7 +19,8 @@ from mcx_jax.env_config import EnvConfig, MotionConfig
 
 def main() -> None:
     startup.configure()
-    from mcx_jax.evaluate import WHO, evaluate, fit_if_needed, load_controller
+    from mcx_jax.evaluate import evaluate
+    from mcx_jax.roster import WHO, fit_if_needed, load_controller
 
     names = sys.argv[1:] or ["ik"]
     if unknown := set(names) - set(WHO):

@@ -71,7 +71,8 @@ def evaluation_rows(rows: list[dict], seconds: float) -> list[dict]:
 
 def run_rows(run: Path) -> list[dict]:
     """`ik` and a trained run on the four seas as CSV rows, with its training steps and seconds."""
-    from mcx_jax.evaluate import evaluate_beside_ik, load_controller
+    from mcx_jax.evaluate import evaluate_beside_ik
+    from mcx_jax.roster import load_controller
     from mcx_jax.run_dir import METRICS, stored_config
 
     config = stored_config(run)

@@ -25,9 +25,10 @@ from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
 from mcx_jax.envs.conditions import Conditions, Noise
 from mcx_jax.envs.plant import Plant
 from mcx_jax.envs.v2v import make_env
-from mcx_jax.evaluate import load_controller, run_episodes
+from mcx_jax.episodes import run_episodes
 from mcx_jax.fitted import fitted
 from mcx_jax.results import WARM_UP_STEPS
+from mcx_jax.roster import load_controller
 from mcx_jax.sharding import env_mesh, put
 
 DELAYS = ("B4_4", "E1", "E2", "butter:4:8Hz")

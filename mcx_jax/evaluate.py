@@ -4,24 +4,18 @@ WHO is ik, extrapolate, extrapolate-best, fir, preview, a run directory or a pol
 seed gives the same motion and the same goals to everyone.
 """
 
-import functools
 import json
-import os
 import sys
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from mcx_jax.assets import policy_file
 from mcx_jax.config import check_seed
 from mcx_jax.delay import parse_delay
 from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.errors import UserError
-
-WHO = ("ik", "extrapolate", "extrapolate-best", "fir", "preview")
-FITTED = ("extrapolate-best", "fir")
+from mcx_jax.roster import fit_if_needed, informed, load_controller
 
 
 @dataclass(frozen=True)
@@ -50,108 +44,6 @@ class EvaluateConfig:
         check_seed(self.seed)
         if self.known_delay:
             parse_delay(self.known_delay)
-
-
-def run_episodes(env, controller, keys, seas, gain, given=None):
-    """Whole episodes, batch axis last inside.
-
-    Args:
-        env: V2VEnv.
-        controller: see mcx_jax.controllers.
-        keys: (N,) PRNG keys.
-        seas: (N,) int32 sea index per episode.
-        gain: (N,) factor of the controller's actions: 0 makes an episode one of the IK baseline, so
-            that baseline and controller share one program (compiling takes ten times the run).
-        given: conditions in place of those that the episodes draw, leaves (..., N).
-
-    Returns:
-        dp (steps, N) m, da (steps, N) rad, valid (N,) bool, correction (steps, 6, N) in cm and
-        crad, and the largest share of its torque limit that a joint uses, (steps, N).
-    """
-    import jax
-    import jax.numpy as jnp
-
-    from mcx_jax.envs.model import torque_limits_nm
-
-    reset = jax.vmap(env.reset, in_axes=(0, 0, None if given is None else -1), out_axes=-1)
-    step = jax.vmap(env.step, in_axes=-1, out_axes=-1)
-    act = jax.vmap(functools.partial(controller.act, env), in_axes=-1, out_axes=-1)
-    state = reset(keys, seas, given)
-    memory = jax.vmap(functools.partial(controller.init, env), in_axes=-1, out_axes=-1)(state)
-
-    def body(carry, _):
-        state, memory = carry
-        memory, action = act(state, memory)
-        action = jnp.clip(gain * action, -bound, bound)
-        after = step(state, action)
-        share = jnp.max(jnp.abs(torques(state, after)) / limits, axis=0)
-        errors = after.metrics.pos_error_m, after.metrics.ang_error_rad
-        return (after, memory), (*errors, action, share)
-
-    bound = env.config.max_correction
-    limits = torque_limits_nm(env.model)[:, None]
-    torques = jax.vmap(env.joint_torques, in_axes=-1, out_axes=-1)
-    (state, _), series = jax.lax.scan(body, (state, memory), None, env.episode_steps)
-    dp, da, action, share = series
-    return dp, da, state.metrics.valid, action, share
-
-
-@functools.cache
-def _compiled():
-    """One jitted `run_episodes` per process, so that repeated evaluations trace once."""
-    import jax
-
-    return jax.jit(run_episodes)
-
-
-def episode_errors(env, controller, gains: tuple[float, ...], episodes: int, seed: int):
-    """Errors of `episodes` test episodes for each gain and each of the env's seas (NumPy).
-
-    The episodes of every gain and sea have the same windows of motion and the same goals, so that
-    a difference is the controller's or the sea's alone.
-
-    Returns:
-        `Series` with leaves (steps, gains, seas, episodes), valid without steps.
-    """
-    import jax
-    import jax.numpy as jnp
-
-    from mcx_jax.sharding import env_mesh, put
-
-    shape = (len(gains), len(env.motion.seas), episodes)
-    keys = jnp.tile(jax.random.split(jax.random.key(seed), episodes), shape[0] * shape[1])
-    seas = jnp.broadcast_to(jnp.arange(shape[1], dtype=jnp.int32)[:, None], shape).ravel()
-    gain = jnp.broadcast_to(jnp.asarray(gains)[:, None, None], shape).ravel()
-    mesh = env_mesh(keys.size)
-    env, controller = put(mesh, (env.replace(whole_batches=True), controller))
-    keys, seas, gain = put(mesh, (keys, seas, gain), 0)
-    with jax.set_mesh(mesh):
-        dp, da, valid, action, share = jax.device_get(
-            _compiled()(env, controller, keys, seas, gain)
-        )
-    return Series(
-        pos_m=dp.reshape(-1, *shape),
-        ang_rad=da.reshape(-1, *shape),
-        valid=valid.reshape(shape),
-        correction=action.reshape(-1, 6, *shape),
-        torque_share=share.reshape(-1, *shape),
-    )
-
-
-@dataclass(frozen=True)
-class Series:
-    """What `episode_errors` records, NumPy; see there for the axes that follow."""
-
-    pos_m: Any
-    """dp (steps, ...)."""
-    ang_rad: Any
-    """da (steps, ...)."""
-    valid: Any
-    """(...) bool."""
-    correction: Any
-    """(steps, 6, ...) cm and crad."""
-    torque_share: Any
-    """(steps, ...) largest share of its limit that a joint's torque has, 1 = at the limit."""
 
 
 @dataclass(frozen=True)
@@ -200,26 +92,11 @@ def evaluation_env(env_config: EnvConfig, motion_config: MotionConfig):
     return make_env(env_config, motion_config, split="test")
 
 
-def fit_if_needed(
-    who: str, controller: Any, env_config: EnvConfig, motion_config: MotionConfig, known_delay: str
-) -> Any:
-    """The controller of `load_controller`, fitted on training motion if it is one of FITTED."""
-    if controller is not None:
-        return controller
-    from mcx_jax.envs.v2v import make_env
-    from mcx_jax.fitted import fitted
-
-    return fitted(who, informed(make_env(env_config, motion_config, split="train"), known_delay))
-
-
-def informed(env, known_delay: str):
-    """The task with controllers without learning told another delay ("": the true one)."""
-    return env.replace(known_delay=parse_delay(known_delay)) if known_delay else env
-
-
 def errors_beside_ik(who: str, controller: Any, env, *, episodes: int, seed: int) -> list[Errors]:
     """Errors of the IK baseline and of a controller on the same episodes; `ik` runs alone."""
     names = ("ik",) if who == "ik" else ("ik", who)
+    from mcx_jax.episodes import episode_errors
+
     found = episode_errors(env, controller, (0.0, 1.0)[: len(names)], episodes, seed)
     return [
         Errors(
@@ -333,38 +210,6 @@ def _effort_line(who: str, rows: list[dict[str, Any]]) -> str:
         f"joint at {100 * share:.0f} % of its torque limit on average, {100 * limited:.1f} % of "
         "the steps at the limit"
     )
-
-
-def policy_path(who: str) -> Path | None:
-    """The policy file of a run directory or a policy file; None for a controller's name.
-
-    Needs no JAX, so that a mistyped name is told at once.
-    """
-    if who in WHO:
-        return None
-    path = policy_file(who)
-    # os.path: also False where no file can have such a name.
-    if not os.path.exists(path) and not os.path.isdir(who):
-        raise UserError(
-            f"unknown controller '{who}': use {', '.join(WHO)}, shipped:DELAY, a run directory or "
-            "a policy .npz"
-        )
-    return path
-
-
-def load_controller(who: str) -> tuple[str, Any]:
-    """(name, controller) for a name, a run directory or a policy file; the controller is None for
-    one of FITTED, which needs a task first (`fit_if_needed`)."""
-    path = policy_path(who)
-    if who in FITTED:
-        return who, None
-    if path is None:
-        from mcx_jax.controllers import CLASSICAL
-
-        return who, CLASSICAL[who]
-    from mcx_jax.policy import PolicyController, load_policy
-
-    return who.rstrip("/"), PolicyController(load_policy(path))
 
 
 def main(argv: list[str] | None = None) -> None:

@@ -18,6 +18,7 @@ from mcx_jax.controllers import HOLD_LEAD_S, Extrapolate, correction
 from mcx_jax.delay import CONTROL_DT_S, PHYSICS_DT_S, SUBSTEPS
 from mcx_jax.envs import conditions
 from mcx_jax.envs.v2v import EnvState, V2VEnv
+from mcx_jax.episodes import episode_errors
 from mcx_jax.spatial import (
     exp_rotation,
     log_rotation,
@@ -140,8 +141,6 @@ def fitted(who: str, env: V2VEnv) -> Any:
 
 def _score(env: V2VEnv, controller: Any) -> float:
     """Mean of dp and da (m + rad) over training episodes, the reward's own measure."""
-    from mcx_jax.evaluate import episode_errors
-
     found = episode_errors(env, controller, (1.0,), 8, FIT_SEED)
     warm = round(1.0 / CONTROL_DT_S)
     return float(np.mean(found.pos_m[warm:]) + np.mean(found.ang_rad[warm:]))

@@ -12,8 +12,9 @@ import pytest
 from mcx_jax.controllers import CLASSICAL
 from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.errors import UserError
-from mcx_jax.evaluate import EvaluateConfig, evaluate, load_controller, print_table
+from mcx_jax.evaluate import EvaluateConfig, evaluate, print_table
 from mcx_jax.results import GROUPS
+from mcx_jax.roster import load_controller
 
 # 20 steps count after the first second; the quiet integrator, so that rounding stays rounding.
 SHORT = EnvConfig(delay="E2", integrator="implicitfast", episode_steps=70)

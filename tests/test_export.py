@@ -25,7 +25,7 @@ from mcx_jax.envs import observe
 from mcx_jax.envs.motion import draw_track
 from mcx_jax.envs.v2v import correct, make_env
 from mcx_jax.envs.vessels import draw_goal
-from mcx_jax.evaluate import run_episodes
+from mcx_jax.episodes import run_episodes
 from mcx_jax.export import main
 from mcx_jax.policy import (
     Policy,

@@ -17,12 +17,7 @@ from mcx_jax.config import TrainConfig
 from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.envs.model import torque_limits_nm
 from mcx_jax.errors import UserError
-from mcx_jax.evaluate import (
-    errors_beside_ik,
-    evaluate_beside_ik,
-    evaluation_env,
-    load_controller,
-)
+from mcx_jax.evaluate import errors_beside_ik, evaluate_beside_ik, evaluation_env
 from mcx_jax.paper import table3
 from mcx_jax.policy import Policy, PolicyMeta, save_policy
 from mcx_jax.ppo.networks import init_params
@@ -31,6 +26,7 @@ from mcx_jax.report import entries, style
 from mcx_jax.report.__main__ import check_out, main
 from mcx_jax.report.episode import lag_s, record
 from mcx_jax.report.spectra import motion_spectra
+from mcx_jax.roster import load_controller
 
 STEPS, EPISODES, SEED = 90, 2, 3
 # The quiet integrator, so that rounding stays rounding.

@@ -70,8 +70,8 @@ class PlayConfig:
 def main(argv: list[str] | None = None) -> None:
     """Command line."""
     from mcx_jax import cli, startup
-    from mcx_jax.evaluate import fit_if_needed
     from mcx_jax.report import entries
+    from mcx_jax.roster import fit_if_needed
 
     argv = list(sys.argv[1:] if argv is None else argv)
     config = cli.parse(PlayConfig, argv, prog="play")

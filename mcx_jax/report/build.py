@@ -12,13 +12,7 @@ import numpy as np
 from mcx_jax import machine
 from mcx_jax.delay import CONTROL_DT_S
 from mcx_jax.envs.model import torque_limits_nm
-from mcx_jax.evaluate import (
-    Errors,
-    errors_beside_ik,
-    evaluation_env,
-    fit_if_needed,
-    rows_beside_ik,
-)
+from mcx_jax.evaluate import Errors, errors_beside_ik, evaluation_env, rows_beside_ik
 from mcx_jax.report import sections, style
 from mcx_jax.report.entries import Entry, learning_curves
 from mcx_jax.report.episode import record
@@ -26,6 +20,7 @@ from mcx_jax.report.page import page
 from mcx_jax.report.sections import Section
 from mcx_jax.report.spectra import motion_spectra
 from mcx_jax.report.table import table
+from mcx_jax.roster import fit_if_needed
 
 Rows = dict[str, list[dict[str, Any]]]
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from mcx_jax import cli
 from mcx_jax.errors import UserError
-from mcx_jax.evaluate import load_controller, policy_path
+from mcx_jax.roster import load_controller, policy_path
 from mcx_jax.run_dir import METRICS, whole_rows
 
 OWN_SETTINGS = ("delay", "arm", "tool_site", "integrator")

@@ -1,0 +1,101 @@
+"""Whole episodes of controllers, as many as wanted in one compiled program."""
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from mcx_jax.envs.model import torque_limits_nm
+from mcx_jax.sharding import env_mesh, put
+
+
+def run_episodes(env, controller, keys, seas, gain, given=None):
+    """Whole episodes, batch axis last inside.
+
+    Args:
+        env: V2VEnv.
+        controller: see mcx_jax.controllers.
+        keys: (N,) PRNG keys.
+        seas: (N,) int32 sea index per episode.
+        gain: (N,) factor of the controller's actions: 0 makes an episode one of the IK baseline, so
+            that baseline and controller share one program (compiling takes ten times the run).
+        given: conditions in place of those that the episodes draw, leaves (..., N).
+
+    Returns:
+        dp (steps, N) m, da (steps, N) rad, valid (N,) bool, correction (steps, 6, N) in cm and
+        crad, and the largest share of its torque limit that a joint uses, (steps, N).
+    """
+    reset = jax.vmap(env.reset, in_axes=(0, 0, None if given is None else -1), out_axes=-1)
+    step = jax.vmap(env.step, in_axes=-1, out_axes=-1)
+    act = jax.vmap(functools.partial(controller.act, env), in_axes=-1, out_axes=-1)
+    state = reset(keys, seas, given)
+    memory = jax.vmap(functools.partial(controller.init, env), in_axes=-1, out_axes=-1)(state)
+
+    def body(carry, _):
+        state, memory = carry
+        memory, action = act(state, memory)
+        action = jnp.clip(gain * action, -bound, bound)
+        after = step(state, action)
+        share = jnp.max(jnp.abs(torques(state, after)) / limits, axis=0)
+        errors = after.metrics.pos_error_m, after.metrics.ang_error_rad
+        return (after, memory), (*errors, action, share)
+
+    bound = env.config.max_correction
+    limits = torque_limits_nm(env.model)[:, None]
+    torques = jax.vmap(env.joint_torques, in_axes=-1, out_axes=-1)
+    (state, _), series = jax.lax.scan(body, (state, memory), None, env.episode_steps)
+    dp, da, action, share = series
+    return dp, da, state.metrics.valid, action, share
+
+
+@functools.cache
+def _compiled():
+    """One jitted `run_episodes` per process, so that repeated evaluations trace once."""
+    return jax.jit(run_episodes)
+
+
+def episode_errors(env, controller, gains: tuple[float, ...], episodes: int, seed: int):
+    """Errors of `episodes` test episodes for each gain and each of the env's seas (NumPy).
+
+    The episodes of every gain and sea have the same windows of motion and the same goals, so that
+    a difference is the controller's or the sea's alone.
+
+    Returns:
+        `Series` with leaves (steps, gains, seas, episodes), valid without steps.
+    """
+    shape = (len(gains), len(env.motion.seas), episodes)
+    keys = jnp.tile(jax.random.split(jax.random.key(seed), episodes), shape[0] * shape[1])
+    seas = jnp.broadcast_to(jnp.arange(shape[1], dtype=jnp.int32)[:, None], shape).ravel()
+    gain = jnp.broadcast_to(jnp.asarray(gains)[:, None, None], shape).ravel()
+    mesh = env_mesh(keys.size)
+    env, controller = put(mesh, (env.replace(whole_batches=True), controller))
+    keys, seas, gain = put(mesh, (keys, seas, gain), 0)
+    with jax.set_mesh(mesh):
+        dp, da, valid, action, share = jax.device_get(
+            _compiled()(env, controller, keys, seas, gain)
+        )
+    return Series(
+        pos_m=dp.reshape(-1, *shape),
+        ang_rad=da.reshape(-1, *shape),
+        valid=valid.reshape(shape),
+        correction=action.reshape(-1, 6, *shape),
+        torque_share=share.reshape(-1, *shape),
+    )
+
+
+@dataclass(frozen=True)
+class Series:
+    """What `episode_errors` records, NumPy; see there for the axes that follow."""
+
+    pos_m: Any
+    """dp (steps, ...)."""
+    ang_rad: Any
+    """da (steps, ...)."""
+    valid: Any
+    """(...) bool."""
+    correction: Any
+    """(steps, 6, ...) cm and crad."""
+    torque_share: Any
+    """(steps, ...) largest share of its limit that a joint's torque has, 1 = at the limit."""

@@ -1,0 +1,62 @@
+"""Controllers by the name that the commands use. Needs no JAX until one is loaded."""
+
+import os
+from pathlib import Path
+from typing import Any
+
+from mcx_jax.assets import policy_file
+from mcx_jax.delay import parse_delay
+from mcx_jax.env_config import EnvConfig, MotionConfig
+from mcx_jax.errors import UserError
+
+WHO = ("ik", "extrapolate", "extrapolate-best", "fir", "preview")
+FITTED = ("extrapolate-best", "fir")
+
+
+def policy_path(who: str) -> Path | None:
+    """The policy file of a run directory or a policy file; None for a controller's name.
+
+    Needs no JAX, so that a mistyped name is told at once.
+    """
+    if who in WHO:
+        return None
+    path = policy_file(who)
+    # os.path: also False where no file can have such a name.
+    if not os.path.exists(path) and not os.path.isdir(who):
+        raise UserError(
+            f"unknown controller '{who}': use {', '.join(WHO)}, shipped:DELAY, a run directory or "
+            "a policy .npz"
+        )
+    return path
+
+
+def load_controller(who: str) -> tuple[str, Any]:
+    """(name, controller) for a name, a run directory or a policy file; the controller is None for
+    one of FITTED, which needs a task first (`fit_if_needed`)."""
+    path = policy_path(who)
+    if who in FITTED:
+        return who, None
+    if path is None:
+        from mcx_jax.controllers import CLASSICAL
+
+        return who, CLASSICAL[who]
+    from mcx_jax.policy import PolicyController, load_policy
+
+    return who.rstrip("/"), PolicyController(load_policy(path))
+
+
+def fit_if_needed(
+    who: str, controller: Any, env_config: EnvConfig, motion_config: MotionConfig, known_delay: str
+) -> Any:
+    """The controller of `load_controller`, fitted on training motion if it is one of FITTED."""
+    if controller is not None:
+        return controller
+    from mcx_jax.envs.v2v import make_env
+    from mcx_jax.fitted import fitted
+
+    return fitted(who, informed(make_env(env_config, motion_config, split="train"), known_delay))
+
+
+def informed(env, known_delay: str):
+    """The task with controllers without learning told another delay ("": the true one)."""
+    return env.replace(known_delay=parse_delay(known_delay)) if known_delay else env
