@@ -13,11 +13,11 @@ VENV := .venv
 PY   := $(VENV)/bin/python
 PIP  := $(PY) -m pip install --disable-pip-version-check --progress-bar off -c constraints.txt
 
-.PHONY: help train bench test check format docs clean
+.PHONY: help train bench test test-slow check format docs clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
-	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 10
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*##/\t/' | expand -t 10
 	@echo
 	@echo "Variables: DELAY=$(DELAY) NUM_ENVS=$(NUM_ENVS) ARGS='more options of the command' PYTHON=$(PYTHON)"
 	@echo "GPU: $(PY) -m pip install -c constraints.txt -e '.[cuda]' after the first make"
@@ -28,8 +28,11 @@ train: $(VENV)/.run  ## train an agent for DELAY, ending with its table beside b
 bench: $(VENV)/.run  ## how fast everything is here, rivals included; let nothing else run
 	$(PY) -m mcx_jax.bench $(ARGS)
 
-test: check  ## lint, format, types, then all tests, cheap ones first
-	$(PY) -m pytest $(ARGS)
+test: check  ## lint, format, types, then the tests but the slow ones, cheap ones first
+	$(PY) -m pytest -m "not slow" $(ARGS)
+
+test-slow: $(VENV)/.dev  ## the slow ones: runs killed 24 times, own data and own arm from end to end
+	$(PY) -m pytest -m slow $(ARGS)
 
 check: $(VENV)/.dev  ## lint, format and types only
 	$(PY) -m ruff check .

@@ -319,7 +319,6 @@ def test_restored_checkpoint_of_another_size_is_refused(finished):
         checkpoint.restore(finished, like)
 
 
-@pytest.mark.slow
 def test_smoke_runs_the_whole_path(tmp_path):
     """Train, checkpoint, evaluate, with the real environment."""
     command = [sys.executable, "-m", "mcx_jax.train", "--smoke", "--delay", "E1"]
