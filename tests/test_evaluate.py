@@ -41,7 +41,7 @@ def test_one_row_a_sea_in_the_contracts_form(ik_rows):
     for row in ik_rows:
         assert list(row) == [
             *("who", "delay", "sea", "episodes", "invalid_episodes", "pos_mm", "ang_mrad"),
-            "improvement",
+            *("correction", "torque_share", "improvement"),
         ]
         assert (row["who"], row["delay"], row["episodes"]) == ("ik", "E2", EPISODES)
         assert row["invalid_episodes"] == 0
@@ -122,7 +122,7 @@ def test_a_wrong_who_is_one_line():
     assert done.returncode == 2
     assert done.stderr.splitlines()[-1] == (
         "error: unknown controller 'nobody': use ik, extrapolate, extrapolate-best, fir, preview, "
-        "a run directory or a policy .npz"
+        "shipped:DELAY, a run directory or a policy .npz"
     )
     assert "Traceback" not in done.stderr
 

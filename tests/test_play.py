@@ -148,7 +148,7 @@ def refused(argv, message):
 
 def test_refusals(tmp_path, monkeypatch):
     refused(["nobody"], "unknown controller 'nobody': use ik, extrapolate, extrapolate-best, "
-            "fir, preview, a run directory or a policy .npz")  # fmt: skip
+            "fir, preview, shipped:DELAY, a run directory or a policy .npz")  # fmt: skip
     wrong = [
         (["--video", "a.avi"], "--video a.avi: the file's name must end in .mp4"),
         (["--frame", "a.jpg"], "--frame a.jpg: the file's name must end in .png"),

@@ -184,7 +184,7 @@ def test_refusals(made, tmp_path):
     refused(
         ["nobody", "--out", out],
         "unknown controller 'nobody': use ik, extrapolate, extrapolate-best, fir, "
-        "preview, a run directory or a policy .npz",
+        "preview, shipped:DELAY, a run directory or a policy .npz",
     )
     refused(
         ["--out", out],
