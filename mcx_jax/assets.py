@@ -1,5 +1,6 @@
 """Where the data files shipped with the package lie."""
 
+import os
 from pathlib import Path
 
 from mcx_jax.errors import UserError
@@ -41,10 +42,11 @@ def policy_file(who: str) -> Path:
     """
     if not who.startswith(SHIPPED):
         path = Path(who)
-        return path / "policy.npz" if path.is_dir() else path
+        # os.path: False, not an error, where no file can have such a name.
+        return path / "policy.npz" if os.path.isdir(path) else path
     folder = asset_path("policies")
     path = folder / f"{who.removeprefix(SHIPPED)}.npz"
-    if not path.is_file():
+    if not os.path.isfile(path):
         names = ", ".join(sorted(f"{SHIPPED}{p.stem}" for p in folder.glob("*.npz")))
         raise UserError(f"{who}: no such policy is shipped; use one of {names}")
     return path

@@ -10,6 +10,7 @@ import os
 import sys
 import tempfile
 import time
+import uuid
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -113,7 +114,8 @@ def _directory(command: TrainCommand) -> Path:
     if command.run_dir:
         return Path(command.run_dir)
     if command.smoke:
-        return Path(tempfile.mkdtemp(prefix="mcx_jax-smoke-"))
+        # A name alone: reading a command line leaves nothing behind.
+        return Path(tempfile.gettempdir()) / f"mcx_jax-smoke-{uuid.uuid4().hex[:12]}"
     return default_path(command.train)
 
 
