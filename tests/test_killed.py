@@ -143,7 +143,9 @@ def test_disk_full_while_training(what, tmp_path, monkeypatch, capsys):
         else:
             patch.setattr(RunDir, "append", append_until)
         with pytest.raises(SystemExit) as stop:
-            startup.run_command(lambda: train(open_new(path, CONFIG), _make_env, 0.0))
+            startup.run_command(
+                lambda: train(open_new(path, CONFIG), _make_env, checkpoint_interval_s=0.0)
+            )
     assert stop.value.code == 2
     assert capsys.readouterr().err == (
         f"error: {path}: cannot be written (No space left on device); mend this, then go on with "
