@@ -2,11 +2,11 @@
 
     python experiments/robust.py RUN...
 
-RUN are trained policies (directories or .npz), all for delay B4_4. Every condition is measured on
-the same windows of motion and goals, 24 episodes in each of the four seas; one compiled program per
-controller runs all conditions. `extrapolate` and `fir` believe in B4_4 throughout and know the age
-of measurements; `fir-nominal` is fitted without disturbances, `fir` under the conditions that the
-robust policy was trained for. Writes experiments/robust.csv.
+RUN are trained policies (directories, .npz, shipped:robust), for B4_4 or several delays. Every
+condition is measured on the same windows of motion and goals, 24 episodes in each of the four seas;
+one compiled program per controller runs all conditions. `extrapolate` and `fir` believe in B4_4
+throughout and know the age of measurements; the lead of `extrapolate-best` is found without
+disturbances, `fir` is fitted under the ranges of ANY and all DELAYS. Writes experiments/robust.csv.
 """
 
 import sys
@@ -20,6 +20,7 @@ import numpy as np
 from record import provenance, write_rows
 
 from mcx_jax import startup
+from mcx_jax.assets import SHIPPED
 from mcx_jax.controllers import CLASSICAL
 from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
 from mcx_jax.envs.conditions import Conditions, Noise
@@ -128,7 +129,8 @@ def main() -> None:
         "fir": (fitted("fir", train), 1.0),
     }
     for who in sys.argv[1:]:
-        controllers[Path(who).name.removesuffix(".npz")] = (load_controller(who)[1], 1.0)
+        name = Path(who.removeprefix(SHIPPED)).name.removesuffix(".npz")
+        controllers[name] = (load_controller(who)[1], 1.0)
     found = []
     for who, (controller, gain) in controllers.items():
         begun = time.monotonic()

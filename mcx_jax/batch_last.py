@@ -1,9 +1,9 @@
 """vmap without batching every operation.
 
-Tracing is a third of `train`'s warm start, and most of it is JAX rewriting thousands of scalar
-operations for a batch, one by one. Functions made of elementwise operations on leading components
-(`x[0] * y[1]`, `stack`) mean the same on arrays with a batch axis behind: they can be called once,
-on the whole batch.
+Most of tracing is JAX rewriting thousands of scalar operations for a batch, one by one (CPU time
+with it and as here: a reset 4.0 and 2.1 s, a training iteration 4.3 and 3.0 s). Functions made of
+elementwise operations on leading components (`x[0] * y[1]`, `stack`) mean the same on arrays with a
+batch axis behind: they can be called once, on the whole batch.
 """
 
 from collections.abc import Callable

@@ -9,7 +9,7 @@ from mcx_jax.errors import UserError, require
 
 @dataclass(frozen=True)
 class Range:
-    """Bounds of a number that is drawn uniformly in each episode; equal: a constant."""
+    """Bounds of a number that is drawn in each episode; equal: a constant."""
 
     low: float
     high: float
@@ -38,7 +38,8 @@ def parse_range(flag: str, text: str, limit: float, whole: bool = False) -> Rang
 
 @dataclass(frozen=True)
 class ConditionsConfig:
-    """What is not as it should be: a number, or LOW:HIGH for one drawn in each episode."""
+    """What is not as it should be: a number, or LOW:HIGH for one drawn in each episode, uniformly
+    (the factor of the inertia: uniformly in its logarithm)."""
 
     noise_mm: str = "0"
     """White noise of the goal's measured position, standard deviation of each axis, mm."""

@@ -1,8 +1,6 @@
 """Whole episodes of controllers, as many as wanted in one compiled program."""
 
 import functools
-from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -36,13 +34,12 @@ def run_episodes(env, controller, keys, seas, gain, given=None):
     def body(carry, _):
         state, memory = carry
         memory, action = act(state, memory)
-        action = jnp.clip(gain * action, -bound, bound)
+        action = env.bounded(gain * action)
         after = step(state, action)
         share = jnp.max(jnp.abs(torques(state, after)) / limits, axis=0)
         errors = after.metrics.pos_error_m, after.metrics.ang_error_rad
         return (after, memory), (*errors, action, share)
 
-    bound = env.config.max_correction
     limits = torque_limits_nm(env.model)[:, None]
     torques = jax.vmap(env.joint_torques, in_axes=-1, out_axes=-1)
     (state, _), series = jax.lax.scan(body, (state, memory), None, env.episode_steps)
@@ -63,7 +60,8 @@ def episode_errors(env, controller, gains: tuple[float, ...], episodes: int, see
     a difference is the controller's or the sea's alone.
 
     Returns:
-        `Series` with leaves (steps, gains, seas, episodes), valid without steps.
+        dp m, da rad, valid, correction cm and crad, torque share as `run_episodes` returns them,
+        with (gains, seas, episodes) for N.
     """
     shape = (len(gains), len(env.motion.seas), episodes)
     keys = jnp.tile(jax.random.split(jax.random.key(seed), episodes), shape[0] * shape[1])
@@ -73,29 +71,5 @@ def episode_errors(env, controller, gains: tuple[float, ...], episodes: int, see
     env, controller = put(mesh, (env.replace(whole_batches=True), controller))
     keys, seas, gain = put(mesh, (keys, seas, gain), 0)
     with jax.set_mesh(mesh):
-        dp, da, valid, action, share = jax.device_get(
-            _compiled()(env, controller, keys, seas, gain)
-        )
-    return Series(
-        pos_m=dp.reshape(-1, *shape),
-        ang_rad=da.reshape(-1, *shape),
-        valid=valid.reshape(shape),
-        correction=action.reshape(-1, 6, *shape),
-        torque_share=share.reshape(-1, *shape),
-    )
-
-
-@dataclass(frozen=True)
-class Series:
-    """What `episode_errors` records, NumPy; see there for the axes that follow."""
-
-    pos_m: Any
-    """dp (steps, ...)."""
-    ang_rad: Any
-    """da (steps, ...)."""
-    valid: Any
-    """(...) bool."""
-    correction: Any
-    """(steps, 6, ...) cm and crad."""
-    torque_share: Any
-    """(steps, ...) largest share of its limit that a joint's torque has, 1 = at the limit."""
+        found = jax.device_get(_compiled()(env, controller, keys, seas, gain))
+    return tuple(x.reshape(*x.shape[:-1], *shape) for x in found)

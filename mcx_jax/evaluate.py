@@ -1,7 +1,7 @@
 """`python -m mcx_jax.evaluate WHO --delay D`: errors of a controller over fixed test episodes.
 
-WHO is ik, extrapolate, extrapolate-best, fir, preview, a run directory or a policy file. The same
-seed gives the same motion and the same goals to everyone.
+WHO is ik, extrapolate, extrapolate-best, fir, preview, shipped:DELAY, a run directory or a policy
+file. The same seed gives the same motion and the same goals to everyone.
 """
 
 import json
@@ -94,20 +94,21 @@ def evaluation_env(env_config: EnvConfig, motion_config: MotionConfig):
 
 def errors_beside_ik(who: str, controller: Any, env, *, episodes: int, seed: int) -> list[Errors]:
     """Errors of the IK baseline and of a controller on the same episodes; `ik` runs alone."""
-    names = ("ik",) if who == "ik" else ("ik", who)
     from mcx_jax.episodes import episode_errors
 
-    found = episode_errors(env, controller, (0.0, 1.0)[: len(names)], episodes, seed)
+    names = ("ik",) if who == "ik" else ("ik", who)
+    gains = (0.0, 1.0)[: len(names)]
+    dp, da, valid, correction, share = episode_errors(env, controller, gains, episodes, seed)
     return [
         Errors(
             who=name,
             delay=env.config.delay,
             seas=env.motion.seas,
-            pos_m=found.pos_m[:, k],
-            ang_rad=found.ang_rad[:, k],
-            valid=found.valid[k],
-            correction=found.correction[:, :, k],
-            torque_share=found.torque_share[:, k],
+            pos_m=dp[:, k],
+            ang_rad=da[:, k],
+            valid=valid[k],
+            correction=correction[:, :, k],
+            torque_share=share[:, k],
         )
         for k, name in enumerate(names)
     ]

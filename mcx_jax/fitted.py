@@ -15,10 +15,11 @@ import numpy as np
 from flax import struct
 
 from mcx_jax.controllers import HOLD_LEAD_S, Extrapolate, correction
-from mcx_jax.delay import CONTROL_DT_S, PHYSICS_DT_S, SUBSTEPS
+from mcx_jax.delay import PHYSICS_DT_S, SUBSTEPS
 from mcx_jax.envs import conditions
 from mcx_jax.envs.v2v import EnvState, V2VEnv
 from mcx_jax.episodes import episode_errors
+from mcx_jax.results import WARM_UP_STEPS
 from mcx_jax.spatial import (
     exp_rotation,
     log_rotation,
@@ -30,7 +31,7 @@ from mcx_jax.spatial import (
 )
 
 TAPS = 25
-"""Poses that the filter sees, half a second of them; twice as many gained nothing measurable."""
+"""Poses that the filter sees, half a second of them."""
 LEADS_S = tuple(HOLD_LEAD_S + x for x in (-0.010, 0.0, 0.004, 0.008, 0.012, 0.020))
 """Leads tried beyond the known delay: the servo's own lag is in none of the names."""
 FIT_EPISODES, FIT_STEPS = 48, 500
@@ -141,6 +142,5 @@ def fitted(who: str, env: V2VEnv) -> Any:
 
 def _score(env: V2VEnv, controller: Any) -> float:
     """Mean of dp and da (m + rad) over training episodes, the reward's own measure."""
-    found = episode_errors(env, controller, (1.0,), 8, FIT_SEED)
-    warm = round(1.0 / CONTROL_DT_S)
-    return float(np.mean(found.pos_m[warm:]) + np.mean(found.ang_rad[warm:]))
+    dp, da, *_ = episode_errors(env, controller, (1.0,), 8, FIT_SEED)
+    return float(np.mean(dp[WARM_UP_STEPS:]) + np.mean(da[WARM_UP_STEPS:]))

@@ -134,7 +134,7 @@ def _to_numpy(told: Told) -> Told:
 @cache
 def _task(env: EnvConfig, motion: MotionConfig, split: Literal["train", "test"]) -> V2VEnv:
     """Shared by all environments of a process with the same settings: the tables are large."""
-    return make_env(env, motion, split=split).replace(whole_batches=True)  # type: ignore
+    return dataclasses.replace(make_env(env, motion, split=split), whole_batches=True)
 
 
 def _make_task(test: bool, settings: dict[str, Any]) -> V2VEnv:

@@ -111,8 +111,13 @@ class PolicyController:
     def act(self, env: Any, state: Any, memory: Carry) -> tuple[Carry, jax.Array]:
         """(memory, (A,) action in cm and crad)."""
         del env
-        # A policy trained without late measurements does not know their age, the last entry.
-        return act(self.policy, memory, state.obs[: self.policy.meta.obs_size])
+        return act(self.policy, memory, self._seen(state.obs))
+
+    def _seen(self, obs: jax.Array) -> jax.Array:
+        """What the policy knows of an observation, whose last entry may be the measurement's age: a
+        policy trained without it does not look, to one trained with it a measurement is new."""
+        size = self.policy.meta.obs_size
+        return jnp.pad(obs, (0, max(size - len(obs), 0)))[:size]
 
 
 def npz_bytes(policy: Policy) -> bytes:

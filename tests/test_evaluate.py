@@ -162,5 +162,18 @@ def test_shipped_policies_are_there_for_the_papers_delays():
         name, controller = load_controller(f"shipped:{delay}")
         assert name == f"shipped:{delay}" and controller.policy.meta.action_size == 6
         assert delay in load_run(f"shipped:{delay}").meta.interface["trained_for"]["delay"]
-    with pytest.raises(UserError, match="shipped:E0.* is shipped|no such policy is shipped.*B4_4"):
+    with pytest.raises(UserError, match="shipped:E7: no such policy is shipped; use one of .*B4_4"):
         load_controller("shipped:E7")
+
+
+def test_a_policy_sees_the_age_of_measurements_or_not():
+    """`shipped:robust` has learnt with it (39 numbers); where it is not observed it is 0."""
+    sizes = {name: load_controller(f"shipped:{name}")[1] for name in ("robust", "E1")}
+    ideal, late = np.arange(1.0, 39.0), np.append(np.arange(1.0, 39.0), 0.06)
+    for name, obs, want in (
+        ("robust", late, late),
+        ("robust", ideal, np.append(ideal, 0.0)),
+        ("E1", late, ideal),
+        ("E1", ideal, ideal),
+    ):
+        np.testing.assert_array_equal(sizes[name]._seen(obs), np.float32(want))

@@ -18,7 +18,7 @@ LEAD_STEPS = 20
 
 
 @pytest.fixture(scope="module")
-def small(request):
+def small():
     """Fewer episodes to fit on: a test is no contest."""
     patch = pytest.MonkeyPatch()
     patch.setattr(fitted, "FIT_EPISODES", 12)
@@ -44,8 +44,8 @@ def test_the_filter_predicts_better_than_a_straight_line(small):
     missed = rms(y - x @ np.asarray(fir.weights[0], np.float64))
     last_change = x.reshape(len(x), 2, fitted.TAPS - 1, 3)[:, :, -1].reshape(-1, 6)
     straight = rms(y - 2.0 * last_change)
-    assert np.all(missed[:3] < 0.5 * straight[:3]), (missed, straight)
-    assert np.all(missed < rms(y))
+    # Measured: 3 to 14 % of what the line misses, of six components.
+    assert np.all(missed < 0.25 * straight), (missed, straight)
 
 
 def test_no_motion_asks_for_no_correction(small):
@@ -66,4 +66,4 @@ def test_late_measurements_have_weights_of_their_own(small):
         x, y = data(env, age=age)
         own = rms(y - x @ np.asarray(fir.weights[age], np.float64))[:3]
         other = rms(y - x @ np.asarray(fir.weights[(age + 1) % 3], np.float64))[:3]
-        assert np.all(own < 0.7 * other)
+        assert np.all(own < 0.7 * other)  # the other weights predict for 20 ms too early or late

@@ -120,8 +120,9 @@ def test_bootstrap_interval_covers_what_it_should():
     for _ in range(200):
         low, high = bootstrap_interval(rng.normal(size=8), draws=300)
         held += low <= 0.0 <= high
-    # Percentile intervals of eight values are too narrow: about 85 to 90 % are known for them.
-    assert 155 <= held <= 199
+    # 182 were measured: percentile intervals of so few values are too narrow. 91 % of 200 has a
+    # deviation of 4; four of those.
+    assert 166 <= held <= 198
     assert bootstrap_interval(np.full(5, 2.0), draws=50) == (2.0, 2.0)
     strata = np.array([[0.0, 0.0], [10.0, 10.0]])
     assert bootstrap_interval(strata, draws=50) == (5.0, 5.0)

@@ -1,4 +1,4 @@
-"""What the controller of an episode is not told: its draw, and the measurement that it sees.
+"""What is not as model and sensor say: its draw for an episode, and the measurement of the goal.
 
 Everything here is None, and costs nothing, where the configuration leaves it out.
 """
@@ -91,7 +91,7 @@ def _between(bounds: Range, uniform: jax.Array) -> jax.Array:
 
 
 def _between_logs(bounds: Range, uniform: jax.Array) -> jax.Array:
-    """Factors: a tenth is as likely as ten."""
+    """Uniform in the logarithm: 0.02 to 0.14 is as likely as 0.14 to 1."""
     return bounds.low * (bounds.high / bounds.low) ** uniform
 
 

@@ -197,9 +197,7 @@ class V2VEnv:
         """
         drawn = state.conditions
         with jax.named_scope("correct"):
-            bound = self.config.max_correction
-            action = jnp.clip(action, -bound, bound)
-            target = self._whole(_corrected, state.measured, action)
+            target = self._whole(_corrected, state.measured, self.bounded(action))
         with jax.named_scope("ik"):
             found = self._solve(state.arm.q, target, ik.WARM_ITERATIONS)
         with jax.named_scope("lag"):
@@ -227,6 +225,10 @@ class V2VEnv:
             done=state.step + 1 >= self.episode_steps,
             metrics=Metrics(*errors, ik_error=found.error, valid=valid),
         )
+
+    def bounded(self, action: jax.Array) -> jax.Array:
+        """The correction that `step` makes of an action: each component within --max-correction."""
+        return jnp.clip(action, -self.config.max_correction, self.config.max_correction)
 
     def goal_on_deck(self, goal_m: jax.Array, drawn: Conditions, step: jax.Array) -> jax.Array:
         """(3,) place of the goal on vessel B, m, at a physics step of the episode."""

@@ -1,6 +1,6 @@
 """`python -m mcx_jax.play WHO`: look at a controller, in the browser, as a film or as a picture.
 
-WHO is ik, extrapolate, preview, a run directory or a policy file; ik is always beside it.
+WHO is whatever `evaluate` takes; ik is always beside it.
 """
 
 import dataclasses
@@ -23,7 +23,8 @@ class PlayConfig:
     """A test episode in the browser; with --video or --frame as a file. Beside the IK baseline."""
 
     who: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="WHO")]
-    """ik, extrapolate, preview, a run directory, or a policy .npz file."""
+    """ik, extrapolate, extrapolate-best, fir, preview, shipped:DELAY, a run directory, or a policy
+    .npz file."""
     video: str = ""
     """Write a film to this .mp4 file instead of serving a page."""
     frame: str = ""
@@ -91,8 +92,10 @@ def main(argv: list[str] | None = None) -> None:
     who = PlayConfig(who=config.who, env=own)
     config = cli.parse(PlayConfig, argv, prog="play", default=who)
     print(config.env.describe_delays(), flush=True)
-    fitted = fit_if_needed(entry.who, entry.controller, config.env, config.motion, "")
-    entry = dataclasses.replace(entry, controller=fitted)
+    if entry.controller is None:
+        fitted = fit_if_needed(entry.who, None, config.env, config.motion, "")
+        settings = {"delay": config.env.delay}  # the page warns where another one is chosen
+        entry = dataclasses.replace(entry, controller=fitted, settings=settings)
     try:
         if config.to_file:
             to_file(config, entry)

@@ -11,7 +11,7 @@ import numpy as np
 import viser
 
 from mcx_jax.controllers import CLASSICAL
-from mcx_jax.delay import CONTROL_DT_S, parse_delay
+from mcx_jax.delay import CONTROL_DT_S, NAMED_DELAYS, parse_delay
 from mcx_jax.envs.v2v import V2VEnv, make_env
 from mcx_jax.errors import UserError
 from mcx_jax.play.episode import EPISODES, Take, simulate
@@ -19,7 +19,6 @@ from mcx_jax.play.page import APART_M, Tableau, add_light, look_at
 from mcx_jax.play.stage import Stage
 from mcx_jax.play.waves import Surface, surface
 
-DELAYS = ("E0", "E1", "E2", "B4_21", "B4_4")
 STRIDE = 2
 """Control steps from one picture to the next: 25 a second."""
 PLOT_EVERY = 5
@@ -90,7 +89,7 @@ class Player:
         gui.configure_theme(show_logo=False, show_share_button=False)
         gui.main_panel.dock_right()
         self._said = gui.add_markdown("")
-        delays = tuple(dict.fromkeys([*DELAYS, wanted.delay]))
+        delays = tuple(dict.fromkeys([*NAMED_DELAYS, wanted.delay]))
         who = gui.add_dropdown("controller", whos, initial_value=wanted.who)
         delay = gui.add_dropdown("delay", delays, initial_value=wanted.delay)
         sea = gui.add_dropdown("sea", seas, initial_value=wanted.sea)

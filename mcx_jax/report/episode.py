@@ -101,7 +101,7 @@ def _sample(env: V2VEnv, before: EnvState, after: EnvState, action: jax.Array) -
         tool_m=jnp.stack(ik.tool_pose(model, angles)[1]),
         pos_error_m=after.metrics.pos_error_m,
         ang_error_rad=after.metrics.ang_error_rad,
-        correction=action,
+        correction=env.bounded(action),
         torque_nm=env.joint_torques(before, after),
     )
 
