@@ -11,7 +11,8 @@ import jax.numpy as jnp
 from flax import struct
 
 from mcx_jax.delay import CONTROL_DT_S, PHYSICS_DT_S
-from mcx_jax.envs.v2v import ACTION_SCALE, EnvState, V2VEnv
+from mcx_jax.envs.state import EnvState
+from mcx_jax.envs.v2v import ACTION_SCALE, V2VEnv
 from mcx_jax.spatial import (
     Mat,
     Vec,

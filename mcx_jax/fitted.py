@@ -17,7 +17,8 @@ from flax import struct
 from mcx_jax.controllers import HOLD_LEAD_S, Extrapolate, correction
 from mcx_jax.delay import PHYSICS_DT_S, SUBSTEPS
 from mcx_jax.envs import conditions
-from mcx_jax.envs.v2v import EnvState, V2VEnv
+from mcx_jax.envs.state import EnvState
+from mcx_jax.envs.v2v import V2VEnv
 from mcx_jax.episodes import episode_errors
 from mcx_jax.results import WARM_UP_STEPS
 from mcx_jax.spatial import (

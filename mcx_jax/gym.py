@@ -34,7 +34,8 @@ from gymnasium.vector.utils import batch_space
 
 from mcx_jax.delay import CONTROL_DT_S
 from mcx_jax.env_config import EnvConfig, MotionConfig
-from mcx_jax.envs.v2v import EnvState, V2VEnv, make_env
+from mcx_jax.envs.state import EnvState
+from mcx_jax.envs.v2v import V2VEnv, make_env
 from mcx_jax.errors import UserError
 from mcx_jax.playground import finite_step
 

@@ -15,7 +15,8 @@ from flax import struct
 
 from mcx_jax.delay import CONTROL_DT_S, PHYSICS_DT_S, SUBSTEPS
 from mcx_jax.env_config import EnvConfig, MotionConfig
-from mcx_jax.envs.v2v import EnvState, V2VEnv, make_env
+from mcx_jax.envs.state import EnvState
+from mcx_jax.envs.v2v import V2VEnv, make_env
 
 
 @struct.dataclass

@@ -36,7 +36,7 @@ from mcx_jax.policy import load_policy, named_arrays  # noqa: E402
 from mcx_jax.programs import prepare  # noqa: E402
 from mcx_jax.progress import Progress  # noqa: E402
 from mcx_jax.run_dir import CONFIG, open_existing, open_new  # noqa: E402
-from mcx_jax.train import train  # noqa: E402
+from mcx_jax.training import train  # noqa: E402
 
 ITERATIONS = 40
 RUN_CONFIG = replace(

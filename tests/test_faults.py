@@ -21,7 +21,7 @@ from mcx_jax.ppo.rollout import replace_broken
 from mcx_jax.programs import Training, prepare
 from mcx_jax.run_dir import open_existing, open_new
 from mcx_jax.sharding import env_mesh
-from mcx_jax.train import train
+from mcx_jax.training import train
 
 # Two blocks of environments in both: environment 5 is not the one renewed first.
 FIRST_ORDER = replace(FIRST_ORDER, env=EnvConfig(episode_steps=32))

@@ -15,7 +15,7 @@ from test_train_command import CONFIG, _contents, _make_env
 from mcx_jax import checkpoint, startup
 from mcx_jax.errors import UserError
 from mcx_jax.run_dir import RunDir, open_existing, open_new
-from mcx_jax.train import train
+from mcx_jax.training import train
 
 
 @pytest.fixture(scope="module")

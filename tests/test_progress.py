@@ -17,7 +17,8 @@ from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.progress import Progress, references
 from mcx_jax.results import paper_means
 from mcx_jax.run_dir import open_existing, open_new
-from mcx_jax.train import main, train
+from mcx_jax.train import main
+from mcx_jax.training import train
 
 FAST = preset_config("fast")
 TINY = replace(
@@ -113,7 +114,7 @@ def test_event_files_hold_every_point_once(tmp_path, monkeypatch):
     assert [step for step, _ in _curves(path)["reward"]] == [64, 128]
     # As if killed after an iteration beyond the checkpoint: that one will be written again.
     with monkeypatch.context() as patch:
-        patch.setattr("mcx_jax.train.save", lambda run, state, rows: _no_save())
+        patch.setattr("mcx_jax.training.save", lambda run, state, rows: _no_save())
         with pytest.raises(RuntimeError, match="killed"):
             train(open_existing(path, TINY), _make_env, events=True)
     train(open_existing(path, TINY), _make_env, events=True)

@@ -24,7 +24,9 @@ from mcx_jax.policy import load_policy
 from mcx_jax.programs import prepare
 from mcx_jax.progress import Progress, short_time
 from mcx_jax.run_dir import default_path, open_existing, open_new
-from mcx_jax.train import StopRequest, compile_quickly, main, read_command, train
+from mcx_jax.stop import StopRequest
+from mcx_jax.train import compile_quickly, main, read_command
+from mcx_jax.training import train
 
 CONFIG = replace(
     preset_config("fast"),

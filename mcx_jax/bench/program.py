@@ -11,7 +11,8 @@ from mcx_jax.bench.timing import median_s
 from mcx_jax.config import TrainConfig
 from mcx_jax.delay import CONTROL_DT_S, SUBSTEPS
 from mcx_jax.envs import ik, lag, observe, vessels
-from mcx_jax.envs.v2v import ArmState, EnvState, V2VEnv
+from mcx_jax.envs.state import ArmState, EnvState
+from mcx_jax.envs.v2v import V2VEnv
 from mcx_jax.ppo import rollout, trainer
 from mcx_jax.ppo.experience import judge
 from mcx_jax.ppo.update import learn

@@ -20,6 +20,7 @@ from mcx_jax.envs.conditions import Conditions, Measurement
 from mcx_jax.envs.goal_path import GoalPath, load_goal_path
 from mcx_jax.envs.model import ChainModel, chain_model, load_mujoco
 from mcx_jax.envs.motion import Motion, Track, draw_track, load_motion
+from mcx_jax.envs.state import ArmState, EnvState, Metrics
 from mcx_jax.envs.vessels import Segment
 from mcx_jax.errors import UserError
 from mcx_jax.spatial import Mat, Vec, exp_rotation, matmul, matvec, norm, unpack, vadd, vscale
@@ -35,55 +36,6 @@ MAX_ERROR_M = 0.5
 """An episode whose tool is farther than this from the goal counts as invalid from then on."""
 MAX_JOINT_SPEED_RAD_S = 100.0
 """Beyond this the simulation has diverged; counts as invalid."""
-
-
-@struct.dataclass
-class ArmState:
-    """Joint state."""
-
-    q: jax.Array
-    """(nq,) joint angles, rad."""
-    qd: jax.Array
-    """(nq,) joint velocities, rad/s."""
-
-
-@struct.dataclass
-class Metrics:
-    """What one control step achieved; scalars, taken at its end."""
-
-    pos_error_m: jax.Array
-    """dp: distance from the tool to the goal."""
-    ang_error_rad: jax.Array
-    """da: angle between the tool and the goal."""
-    ik_error: jax.Array
-    """Remaining IK error, m + rad."""
-    valid: jax.Array
-    """bool, sticky within an episode: no IK failure, no excess error, all finite."""
-
-
-@struct.dataclass
-class EnvState:
-    """Everything that changes within an episode."""
-
-    arm: ArmState
-    lag: tuple[lag.LagState, ...]
-    reference: jax.Array
-    """(nq,) late joint reference q_hat of the last control step, rad."""
-    track: Track
-    goal_m: jax.Array
-    """(3,) place of the goal on vessel B; a path is about it."""
-    conditions: Conditions
-    measured: Measurement
-    """T_G^B now, as far as the controller knows."""
-    step: jax.Array
-    """() int32 control steps done."""
-    obs: jax.Array
-    """(38,) see observe.OBS_TABLE; (39,) with the measurement's age where that is not 0."""
-    reward: jax.Array
-    """() -(dp + da) at the end of the last step (paper eq. 4)."""
-    done: jax.Array
-    """() bool: the time limit is reached (never a failure: nothing terminates)."""
-    metrics: Metrics
 
 
 @struct.dataclass

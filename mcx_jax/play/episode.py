@@ -14,7 +14,8 @@ from flax import struct
 from mcx_jax.delay import CONTROL_DT_S, PHYSICS_DT_S, SUBSTEPS
 from mcx_jax.envs import vessels
 from mcx_jax.envs.motion import Motion, Track
-from mcx_jax.envs.v2v import EnvState, V2VEnv
+from mcx_jax.envs.state import EnvState
+from mcx_jax.envs.v2v import V2VEnv
 from mcx_jax.report.episode import side_by_side
 from mcx_jax.spatial import matmul, rotation_rpy, vadd
 

@@ -13,7 +13,8 @@ from flax import struct
 
 from mcx_jax.delay import CONTROL_DT_S
 from mcx_jax.envs import ik
-from mcx_jax.envs.v2v import EnvState, V2VEnv
+from mcx_jax.envs.state import EnvState
+from mcx_jax.envs.v2v import V2VEnv
 from mcx_jax.spatial import unpack
 
 
