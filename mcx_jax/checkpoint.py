@@ -24,7 +24,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from mcx_jax import hosts
 from mcx_jax.errors import UserError
 
 FORMAT = 2
@@ -42,6 +44,8 @@ class _Refused(Exception):
 def save(run_dir: Path, iteration: int, state: Any, config: str = "") -> None:
     """Write the state after `iteration` iterations; whole or not at all, and only once.
 
+    Of several processes (`mcx_jax.hosts`) all have to call this, and the first one writes.
+
     Args:
         config: the run's configuration (`cli.config_to_json`).
 
@@ -49,17 +53,17 @@ def save(run_dir: Path, iteration: int, state: Any, config: str = "") -> None:
         UserError: it cannot be written; the checkpoints that were there still are.
     """
     folder = (run_dir / FOLDER).absolute()
-    if latest(run_dir) == iteration:
+    flat = hosts.whole(flatten(state))
+    if not hosts.first() or latest(run_dir) == iteration:
         return
     partial = folder / f".{iteration}.partial"
-    flat = flatten(state)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for left in folder.glob(".*.partial"):  # by a killed process
             shutil.rmtree(left)
         partial.mkdir()
         ocp = _orbax()
-        with ocp.Checkpointer(ocp.StandardCheckpointHandler()) as writer:
+        with _alone(ocp) as writer:
             writer.save(partial / STATE, args=ocp.args.StandardSave(flat))
         _write_manifest(partial, iteration, config, _types(flat))
         partial.rename(folder / str(iteration))
@@ -126,12 +130,14 @@ def restore(run_dir: Path, like: Any, iteration: int | None = None) -> Any:
     wanted = flatten(like)
     _check_types(where, check(run_dir, iteration)["leaves"], _types(wanted))
     ocp = _orbax()
+    # Read into the host's memory and laid out from there, which any number of processes can do.
+    blank = {path: np.zeros(leaf.shape, leaf.dtype) for path, leaf in wanted.items()}
     try:
-        with ocp.Checkpointer(ocp.StandardCheckpointHandler()) as reader:
-            stored = reader.restore(where / STATE, args=ocp.args.StandardRestore(wanted))
+        with _alone(ocp) as reader:
+            stored = reader.restore(where / STATE, args=ocp.args.StandardRestore(blank))
     except (ValueError, KeyError, OSError, TypeError) as error:
         raise UserError(f"{where}: cannot be restored ({_reason(error)})") from None
-    return _unflatten(like, stored)
+    return _unflatten(like, {path: _laid_out(x, wanted[path]) for path, x in stored.items()})
 
 
 def set_aside_after(run_dir: Path, iteration: int) -> None:
@@ -293,6 +299,13 @@ def _orbax() -> Any:
     return ocp
 
 
+def _alone(ocp: Any) -> Any:
+    """A writer and reader that waits for no other process."""
+    me = jax.process_index()
+    options = ocp.options.MultiprocessingOptions(primary_host=me, active_processes={me})
+    return ocp.Checkpointer(ocp.StandardCheckpointHandler(), multiprocessing_options=options)
+
+
 def _unraisable(what: Any) -> None:
     """When one array fails, orbax's threads for the others report, now or a moment later, to an
     event loop that is closed by then. Everything else is shown as before."""
@@ -307,10 +320,17 @@ def _is_key(leaf: Any) -> bool:
 def _raw(leaf: Any) -> Any:
     if not isinstance(leaf, jax.ShapeDtypeStruct):
         return jax.random.key_data(leaf) if _is_key(leaf) else leaf
-    if _is_key(leaf):
-        leaf = jax.eval_shape(jax.random.key_data, leaf)
-    sharding = leaf.sharding or jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
+    if not _is_key(leaf):
+        return leaf
+    raw = jax.eval_shape(jax.random.key_data, leaf)
+    sharding = leaf.sharding  # its axes are the raw data's first ones
+    return jax.ShapeDtypeStruct(raw.shape, raw.dtype, sharding=sharding)
+
+
+def _laid_out(stored: np.ndarray, like: Any) -> jax.Array:
+    """A stored array where its model lies."""
+    sharding = like.sharding or jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    return jax.make_array_from_callback(stored.shape, sharding, lambda part: stored[part])
 
 
 def _unflatten(like: Any, flat: dict[str, Any]) -> Any:

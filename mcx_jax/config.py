@@ -124,15 +124,18 @@ class FirstOrderConfig:
     """Control steps that a gradient reaches through; the longest delay of the paper is two."""
     windows: int = 10
     """Windows of --horizon-steps, each with one gradient step, in one iteration."""
-    tail_mm: float = 0.0
-    """Errors beyond this (mm + mrad) weigh more: the loss is e + e^2 / (2 tail_mm); 0 = off."""
+    relative_mm: float = 0.0
+    """f of the loss f log(1 + e / f) for a window of an environment with mean error e, in mm and in
+    mrad; 0 = off, the loss is e. For agents that train under easy and hard conditions at once: a
+    tenth less counts about as much in each."""
     learning_rate: float = 1e-3
     """Adam step size, falling along half a cosine to 5 %. Not tuned since the gradient is that of
     unlimited servos; with the true one 3e-3 ended far worse than 1e-3."""
 
     def __post_init__(self) -> None:
         require(
-            0 <= self.tail_mm < float("inf"), f"--tail-mm {self.tail_mm}: must be 0 or positive"
+            0 <= self.relative_mm < float("inf"),
+            f"--relative-mm {self.relative_mm}: must be 0 or positive",
         )
         for name in ("horizon_steps", "windows", "learning_rate"):
             value = getattr(self, name)

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mcx_jax import checkpoint
+from mcx_jax import checkpoint, hosts
 from mcx_jax.config import TrainConfig
 from mcx_jax.errors import UserError
 from mcx_jax.ppo.networks import step
@@ -83,8 +83,8 @@ class Watch:
         good = f"the checkpoint of iteration {last} is kept" if last else "there is no checkpoint"
         path = where / f"diverged-{rows[0]['iteration']}.npz"
         try:
-            if not path.exists():
-                arrays = states(self.run.config, self.before, state)
+            arrays = states(self.run.config, self.before, state)
+            if self.run.writes and not path.exists():
                 np.savez(path, allow_pickle=False, rows=json.dumps(rows), **arrays)
             dump = f"the states are in {path}"
         except OSError as error:
@@ -112,4 +112,4 @@ def states(config: TrainConfig, before: Any, after: Any) -> dict[str, np.ndarray
         if state is not None:
             flat[f"{name}.action"] = act(state)
             flat |= {name + path: leaf for path, leaf in checkpoint.flatten(state).items()}
-    return {name: np.asarray(jax.device_get(leaf)) for name, leaf in flat.items()}
+    return {name: np.asarray(leaf) for name, leaf in hosts.whole(flat).items()}

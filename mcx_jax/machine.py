@@ -13,7 +13,10 @@ def describe() -> str:
 
     devices = jax.devices()
     said = ", ".join(f"{name} {value}" for name, value in versions().items())
-    return f"device: {len(devices)} x {devices[0].device_kind} ({devices[0].platform}); {said}"
+    count = jax.process_count()
+    of = f" of {count} processes" if count > 1 else ""
+    kind = f"{devices[0].device_kind} ({devices[0].platform})"
+    return f"device: {len(devices)} x {kind}{of}; {said}"
 
 
 def device() -> str:

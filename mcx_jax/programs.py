@@ -89,9 +89,9 @@ def prepare(config: TrainConfig, env: Any, mesh: Mesh | None = None) -> Training
 
     Args:
         env: on any device.
-        mesh: None = as many devices as the configuration can use.
+        mesh: None = as many devices, of all processes, as the configuration can use.
     """
-    mesh = env_mesh(config.shards) if mesh is None else mesh
+    mesh = env_mesh(config.shards, jax.devices()) if mesh is None else mesh
     algo = algorithm(config)
     if isinstance(env, V2VEnv):
         env = replace(env, whole_batches=True)

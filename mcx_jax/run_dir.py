@@ -8,6 +8,7 @@ exactly (docs/trust.md). Needs no JAX device, so that a mistake is told at once.
 import contextlib
 import fcntl
 import json
+import math
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -35,14 +36,19 @@ class RunDir:
     config: TrainConfig
     start_iteration: int = 0
     """Iteration of the checkpoint to go on from; 0 = a new run."""
+    writes: bool = True
+    """False in all but one of the processes that share a run (`mcx_jax.hosts`)."""
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
-        """Keep every other process out; makes the directory.
+        """Keep every other run's process out; makes the directory.
 
         Raises:
             UserError: another process is in it, or was since it was opened; it cannot be written.
         """
+        if not self.writes:
+            yield
+            return
         with writing(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
             file = (self.path / LOCK).open("a")
@@ -64,6 +70,8 @@ class RunDir:
 
     def create(self) -> None:
         """Write config.json, and metrics up to where the run goes on from."""
+        if not self.writes:
+            return
         with writing(self.path):
             if not (self.path / CONFIG).exists():
                 _write_whole(self.path / CONFIG, cli.config_to_json(self.config))
@@ -72,13 +80,14 @@ class RunDir:
 
     def last_rows(self, iterations: int = 1) -> list[dict[str, Any]]:
         """Rows of metrics.jsonl of the last iterations, one per iteration and seed."""
-        lines = (self.path / METRICS).read_text().splitlines()
-        return [json.loads(line) for line in lines[-iterations * self.config.seeds :]]
+        return whole_rows(self.path / METRICS)[-iterations * self.config.seeds :]
 
     def append(self, rows: list[dict[str, Any]]) -> None:
         """Add rows to metrics.jsonl."""
+        if not self.writes:
+            return
         with writing(self.path), (self.path / METRICS).open("a") as file:
-            file.writelines(json.dumps(row) + "\n" for row in rows)
+            file.writelines(_line(row) for row in rows)
             file.flush()
             os.fsync(file.fileno())  # a checkpoint must not be on the disk before its rows
 
@@ -161,12 +170,13 @@ def _check_writable(path: Path) -> None:
 def _cut_metrics(path: Path, iteration: int) -> None:
     """Leave out rows after the checkpoint (and a row cut short): they will be written again."""
     rows = whole_rows(path) if path.is_file() else []
-    kept = [json.dumps(row) + "\n" for row in rows if row["iteration"] <= iteration]
+    kept = [_line(row) for row in rows if row["iteration"] <= iteration]
     _write_whole(path, "".join(kept))
 
 
 def whole_rows(path: Path) -> list[dict[str, Any]]:
-    """The rows of metrics.jsonl, without lines that a killed process or a bad disk left."""
+    """The rows of metrics.jsonl, without lines that a killed process or a bad disk left; what was
+    not finite is NaN."""
     rows = []
     for line in path.read_text("utf-8", errors="replace").splitlines():
         try:
@@ -174,8 +184,16 @@ def whole_rows(path: Path) -> list[dict[str, Any]]:
         except (ValueError, RecursionError):
             continue
         if isinstance(row, dict) and isinstance(row.get("iteration"), int):
-            rows.append(row)
+            rows.append({name: math.nan if x is None else x for name, x in row.items()})
     return rows
+
+
+def _line(row: dict[str, Any]) -> str:
+    """Strict JSON, which has no NaN and no infinity: they are null."""
+    strict = {
+        k: None if isinstance(x, float) and not math.isfinite(x) else x for k, x in row.items()
+    }
+    return json.dumps(strict, allow_nan=False) + "\n"
 
 
 def _write_whole(path: Path, text: str) -> None:

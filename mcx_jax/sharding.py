@@ -12,20 +12,36 @@ wait for all of them after each (see `stage`): 2048 environments on two cores, a
 3.0 us like that, 1.8 us with two devices.
 """
 
-from typing import TypeVar
+from collections.abc import Sequence
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from mcx_jax.errors import UserError
+
 ENV_AXIS = "env"
 Tree = TypeVar("Tree")
 
 
-def env_mesh(shards: int) -> Mesh:
-    """A mesh over as many devices as divide `shards`: one device if nothing else does."""
-    devices = jax.devices()
+def env_mesh(shards: int, devices: Sequence[Any] | None = None) -> Mesh:
+    """A mesh over as many devices as divide `shards`: one device if nothing else does.
+
+    Args:
+        devices: None = those of this process. With devices of other processes among them all must
+            divide `shards`, or a process would have nothing to do.
+
+    Raises:
+        UserError: they do not.
+    """
+    devices = jax.local_devices() if devices is None else devices
     count = max(n for n in range(1, len(devices) + 1) if shards % n == 0)
+    if count < len(devices) and len({d.process_index for d in devices}) > 1:
+        raise UserError(
+            f"{len(devices)} devices of all processes cannot share {shards} groups of environments "
+            f"evenly: start with a number of devices that divides {shards}, or change --num-envs"
+        )
     return Mesh(np.array(devices[:count]), (ENV_AXIS,))
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from mcx_jax import cli, machine, tensorboard
+from mcx_jax import cli, hosts, machine, tensorboard
 from mcx_jax.config import TrainConfig, preset_config
 from mcx_jax.errors import UserError
 from mcx_jax.run_dir import (
@@ -50,6 +50,10 @@ class TrainCommand:
     """Try the whole path on a tiny run (a minute), in a temporary directory unless --run-dir."""
     device: Literal["auto", "cpu", "gpu"] = "auto"
     """Where to compute."""
+    distributed: str = ""
+    """One run over several processes that see the same --run-dir: auto (Slurm, Open MPI or
+    Kubernetes tell who takes part) or HOST:PORT,I/N (this is process I of N, and process 0 listens
+    there)."""
     tensorboard: bool = False
     """Also write TensorBoard event files into the run's directory (extra viz)."""
     train: TrainConfig = field(default_factory=TrainConfig)
@@ -62,6 +66,7 @@ class TrainCommand:
         ):
             if not value >= 0:
                 raise UserError(f"{flag} {value}: must be 0 or a positive number")
+        hosts.check(self.distributed)
 
 
 def smoke_config(config: TrainConfig) -> TrainConfig:
@@ -152,8 +157,9 @@ def main(argv: list[str] | None = None) -> None:
         tensorboard.require()
     if command.smoke:
         print(compile_quickly())
-    for line in startup.configure(command.device, mjx=run.config.env.physics == "mjx"):
-        print(line)
+    said = startup.configure(command.device, mjx=run.config.env.physics == "mjx")
+    hosts.join(command.distributed)
+    print(*said, sep="\n")
     print(machine.describe())
     print(run.config.env.describe_delays())
     print(f"run directory: {run.path}", flush=True)
@@ -169,6 +175,9 @@ def main(argv: list[str] | None = None) -> None:
     except KeyboardInterrupt:
         print("\nstopped before the end of an iteration; go on with --resume if a run had begun")
         raise SystemExit(130) from None
+    hosts.part()
+    if not hosts.first():
+        return
     length = (SMOKE_EPISODES, SMOKE_STEPS) if command.smoke else (FINAL_EPISODES, FINAL_STEPS)
     try:
         final_table(run.config, policy, *length)

@@ -6,9 +6,10 @@
 import contextlib
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from mcx_jax import checkpoint, cli, tensorboard
+from mcx_jax import checkpoint, cli, hosts, tensorboard
 from mcx_jax.config import TrainConfig
 from mcx_jax.progress import Progress, short_time
 from mcx_jax.run_dir import POLICY, RunDir, writing
@@ -77,11 +78,12 @@ def save(run: RunDir, state: "TrainState", rows: list[dict[str, Any]]) -> "tuple
 
     policies = policies_of(run.config, state)
     best = max(range(len(policies)), key=lambda k: rows[k]["reward"] if rows else 0.0)
-    with writing(run.path):
-        if len(policies) > 1:
-            for policy in policies:
-                save_policy(run.path / f"policy_s{policy.meta.seed}.npz", policy)
-        save_policy(run.path / POLICY, policies[best])
+    if run.writes:
+        with writing(run.path):
+            if len(policies) > 1:
+                for policy in policies:
+                    save_policy(run.path / f"policy_s{policy.meta.seed}.npz", policy)
+            save_policy(run.path / POLICY, policies[best])
     # Last: a run killed before goes on from the checkpoint before, and writes the policies again.
     config = cli.config_to_json(run.config)
     checkpoint.save(run.path, policies[0].meta.iteration, state, config)
@@ -119,9 +121,11 @@ def iterate(
             events.append(rows)
         progress.show(rows)
         watch.after_iteration(state, rows)
+        overdue = time.monotonic() - saved > checkpoint_interval_s
+        stop.signum, overdue = hosts.agree(stop.signum, overdue)
         if stop.signum:
             break
-        if time.monotonic() - saved > checkpoint_interval_s and not watch.lost:
+        if overdue and not watch.lost:
             watch.check(state, rows)
             save(run, state, rows)
             saved = time.monotonic()
@@ -150,8 +154,9 @@ def train(
             diverges.
         SystemExit: stopped by a signal, after saving.
     """
-    with run.held():
-        return _train(run, make_env, events, checkpoint_interval_s)
+    run = replace(run, writes=hosts.first())
+    with run.held(), hosts.together(run.path):
+        return _train(run, make_env, events and run.writes, checkpoint_interval_s)
 
 
 def _train(
@@ -174,6 +179,7 @@ def _train(
     else:
         state = training.start()
     run.create()
+    hosts.agree(0)  # the others read what it has cut
     if run.start_iteration:
         print(f"going on after iteration {run.start_iteration}")
     with contextlib.ExitStack() as stack:

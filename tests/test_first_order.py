@@ -69,6 +69,25 @@ def test_gradient_equals_a_central_difference(training):
     np.testing.assert_allclose(slope, norm, rtol=1e-2)
 
 
+def test_relative_loss_by_hand(training):
+    """f log(1 + e / f) of every environment's mean errors; with a large f as without it."""
+    env, state = training.env, training.start()
+
+    def window(relative_mm):
+        config = replace(CONFIG, first_order=replace(CONFIG.first_order, relative_mm=relative_mm))
+        params = jax.tree.map(lambda p: p + 0.1, state.learner.policy.params)
+        arguments = config, env, state.obs_stats, state.actors
+        loss, _, (_, _, metrics) = trainer.window_gradient(params, *arguments)
+        return float(loss), metrics
+
+    plain, metrics = window(0.0)
+    means = np.stack([np.mean(e, axis=0) for e in (metrics.pos_error_m, metrics.ang_error_rad)])
+    np.testing.assert_allclose(plain, means.sum(0).mean(), rtol=1e-6)  # float32 sums
+    relative = 0.05 * np.log(1 + means / 0.05)
+    np.testing.assert_allclose(window(50.0)[0], relative.sum(0).mean(), rtol=1e-5)
+    np.testing.assert_allclose(window(1e7)[0], plain, rtol=1e-4)  # e / 2f = 1 / 20,000
+
+
 def test_failed_environments_are_never_learned_from(training):
     state, metrics, _ = run(training, make_probe(fail_at=5), 3)
     # Both windows of 8 steps: invalid and NaN from step 5 on, and reset before the next.

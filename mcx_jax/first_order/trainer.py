@@ -102,8 +102,8 @@ def init(config: TrainConfig, env: Any, seed: jax.Array, blocks: list[Any]) -> T
 
 
 def window_gradient(params, config: TrainConfig, env: Any, stats: RunningStats, actors: Actors):
-    """Mean of dp + da (m + rad; large ones weigh more with --tail-mm) over a window's valid steps,
-    and its gradient by the policy.
+    """Mean of dp + da (m + rad) over a window's valid steps, with --relative-mm of a logarithm of
+    it, and its gradient by the policy.
 
     The gradient runs from an error through the physics, the lag and the IK to the actions before
     it, and through the policy's memory to its weights; on the way from an action through what is
@@ -126,12 +126,17 @@ def window_gradient(params, config: TrainConfig, env: Any, stats: RunningStats, 
 
         steps = config.first_order.horizon_steps
         after, (obs, metrics) = jax.lax.scan(one_step, actors, None, steps)
-        error = metrics.pos_error_m + metrics.ang_error_rad
-        if config.first_order.tail_mm:
-            error = error + error**2 / (2e-3 * config.first_order.tail_mm)
-        # where, not a product: a NaN times zero is NaN.
-        kept = jnp.where(metrics.valid, error, 0.0)
-        loss = jnp.sum(kept) / jnp.maximum(jnp.sum(metrics.valid), 1)
+        count = jnp.sum(metrics.valid, axis=0)
+
+        def mean(error: jax.Array) -> jax.Array:
+            """(N,) of the valid steps; where, not a product: a NaN times zero is NaN."""
+            return jnp.sum(jnp.where(metrics.valid, error, 0.0), axis=0) / jnp.maximum(count, 1)
+
+        scale = 1e-3 * config.first_order.relative_mm
+        terms = mean(metrics.pos_error_m), mean(metrics.ang_error_rad)
+        if scale:
+            terms = tuple(scale * jnp.log1p(error / scale) for error in terms)
+        loss = jnp.sum(count * (terms[0] + terms[1])) / jnp.maximum(jnp.sum(count), 1)
         return loss, (after, obs, metrics)
 
     (loss, aux), gradient = jax.value_and_grad(simulate, has_aux=True)(params)

@@ -1,0 +1,140 @@
+"""Several processes that train one run, on one machine or on many: who writes, what is agreed on.
+
+The programs are the same as in one process: XLA's partitioner sees the devices of all of them
+(`mcx_jax.sharding`). What is left for Python: process 0 alone writes and prints, all decide alike,
+and who loses a partner stops. Every process needs to see the run's directory.
+"""
+
+import contextlib
+import os
+import re
+import sys
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from mcx_jax.errors import UserError
+
+PLACE = re.compile(r"(?P<coordinator>[^,\s]+:\d+),(?P<index>\d+)/(?P<count>\d+)")
+BROKEN = re.compile("Gloo|NCCL|UNAVAILABLE|[Cc]onnection|heartbeat")
+"""What JAX's errors say when another process has gone (on a CPU they are ValueErrors)."""
+LINE = 400
+"""Characters of an error that are shown."""
+WAIT_S = 120
+"""For the other processes to begin."""
+
+
+def check(text: str) -> None:
+    """Refuse a value of --distributed that cannot be meant."""
+    place = PLACE.fullmatch(text)
+    if text not in ("", "auto") and not (place and int(place["index"]) < int(place["count"])):
+        raise UserError(
+            f"--distributed {text}: must be auto (Slurm, Open MPI or Kubernetes tell the rest) or "
+            "HOST:PORT,I/N, which is process I of 0 to N - 1 and where process 0 listens"
+        )
+
+
+def join(text: str) -> None:
+    """Meet the other processes; call before anything is computed. Those after the first fall silent
+    on stdout. Does nothing for "".
+
+    Args:
+        text: value of --distributed.
+
+    Raises:
+        UserError: they do not come, or `auto` finds no cluster.
+    """
+    if not text:
+        return
+    import jax
+
+    place = PLACE.fullmatch(text)
+    try:
+        if place:
+            jax.distributed.initialize(
+                place["coordinator"],
+                int(place["count"]),
+                int(place["index"]),
+                initialization_timeout=WAIT_S,
+            )
+        else:
+            jax.distributed.initialize(initialization_timeout=WAIT_S)
+    except (RuntimeError, ValueError) as error:
+        reason = str(error).strip().splitlines()[0][:200]
+        raise UserError(f"--distributed {text}: the processes did not meet ({reason})") from None
+    if not first():
+        contextlib.redirect_stdout(open(os.devnull, "w")).__enter__()  # for good
+
+
+def first() -> bool:
+    """Whether this process writes and prints: process 0, or the only one."""
+    import jax
+
+    return jax.process_index() == 0
+
+
+def alone() -> bool:
+    """Whether there is one process."""
+    import jax
+
+    return jax.process_count() == 1
+
+
+def agree(*numbers: int) -> tuple[int, ...]:
+    """The largest of each over all processes, which all have to call this."""
+    if alone():
+        return numbers
+    import numpy as np
+    from jax.experimental import multihost_utils
+
+    found = multihost_utils.process_allgather(np.array(numbers, np.int32))
+    return tuple(int(x) for x in np.asarray(found).reshape(-1, len(numbers)).max(0))
+
+
+def whole(arrays: dict[str, Any]) -> dict[str, Any]:
+    """The arrays with the parts of all processes, on the host, which all have to call this; in one
+    process as they are."""
+    if alone():
+        return arrays
+    import jax
+    import numpy as np
+    from jax.experimental import multihost_utils
+
+    def gather(x: Any) -> Any:
+        if x.is_fully_replicated:
+            return np.asarray(jax.device_get(x))
+        return multihost_utils.process_allgather(x, tiled=True)
+
+    return {name: gather(x) for name, x in arrays.items()}
+
+
+@contextlib.contextmanager
+def together(path: Path) -> Iterator[None]:
+    """What ends one process ends all: the others notice by a broken connection, say so in a line
+    and leave with exit code 2. In one process this does nothing."""
+    import jax
+
+    try:
+        yield
+    except Exception as error:
+        if alone():
+            raise
+        code, said = 2, str(error).strip().splitlines()[0]
+        if BROKEN.search(said):
+            me = f"process {jax.process_index()} of {jax.process_count()}"
+            said = f"{path}: {me} has lost another one; start all again with --resume ({said})"
+        elif not isinstance(error, UserError):
+            traceback.print_exc()
+            code = 1
+        print(f"error: {said[:LINE]}", file=sys.stderr, flush=True)
+        # Not by SystemExit: on the way out JAX would wait for the others, and then abort.
+        os._exit(code)
+
+
+def part() -> None:
+    """The end of the common work: from here on every process is on its own."""
+    import jax
+
+    if not alone():
+        jax.distributed.shutdown()

@@ -1,0 +1,24 @@
+"""One process of several that train a run: `python two_processes.py RUN PLACE`."""
+
+import sys
+from pathlib import Path
+
+import lives
+
+from mcx_jax import hosts, startup
+from mcx_jax.run_dir import CONFIG, open_existing, open_new
+from mcx_jax.training import train
+
+
+def main() -> None:
+    run, place = Path(sys.argv[1]), sys.argv[2]
+    begun = (run / CONFIG).exists()
+    opened = (open_existing if begun else open_new)(run, lives.RUN_CONFIG)
+    hosts.join(place)
+    train(opened, lives.make_env, checkpoint_interval_s=0.0)
+    hosts.part()
+    print("parted", hosts.first(), flush=True)
+
+
+if __name__ == "__main__":
+    startup.run_command(main)
