@@ -85,7 +85,7 @@ def test_relative_loss_by_hand(training):
     np.testing.assert_allclose(plain, means.sum(0).mean(), rtol=1e-6)  # float32 sums
     relative = 0.05 * np.log(1 + means / 0.05)
     np.testing.assert_allclose(window(50.0)[0], relative.sum(0).mean(), rtol=1e-5)
-    np.testing.assert_allclose(window(1e7)[0], plain, rtol=1e-4)  # e / 2f = 1 / 20,000
+    np.testing.assert_allclose(window(1e7)[0], plain, rtol=1e-3)  # e / 2f: 12 / 20,000 at most
 
 
 def test_failed_environments_are_never_learned_from(training):
