@@ -70,21 +70,23 @@ def evaluation_rows(rows: list[dict], seconds: float) -> list[dict]:
 
 
 def run_rows(run: Path) -> list[dict]:
-    """`ik` and a trained run on the four seas as CSV rows, with its training steps and seconds."""
+    """`ik` and every seed of a trained run on the four seas as CSV rows, with the run's training
+    steps (of one seed) and seconds (of all)."""
     from mcx_jax.evaluate import evaluate_beside_ik
     from mcx_jax.roster import load_controller
-    from mcx_jax.run_dir import METRICS, stored_config
+    from mcx_jax.run_dir import METRICS, POLICY, stored_config
 
     config = stored_config(run)
     last = json.loads((run / METRICS).read_text().splitlines()[-1])
-    _, controller = load_controller(str(run))
     env = replace(config.env, episode_steps=1000)
-    begun = time.monotonic()
-    baseline, rows = evaluate_beside_ik(config.algo, controller, env, config.motion)
-    found = evaluation_rows(baseline + rows, time.monotonic() - begun)
-    steps = {
-        "seed": config.seed,
-        "steps": last["steps"],
-        "train_seconds": f"{last['wall_s']:.0f}",
-    }
-    return [{**row, **steps, **provenance()} for row in found]
+    out: list[dict] = []
+    for k in range(config.seeds):
+        seed = config.seed + k
+        file = POLICY if config.seeds == 1 else f"policy_s{seed}.npz"
+        _, controller = load_controller(str(run / file))
+        begun = time.monotonic()
+        baseline, rows = evaluate_beside_ik(config.algo, controller, env, config.motion)
+        found = evaluation_rows(rows if k else baseline + rows, time.monotonic() - begun)
+        trained = {"steps": last["steps"], "train_seconds": f"{last['wall_s']:.0f}"}
+        out += [{**row, "seed": seed, **trained, **provenance()} for row in found]
+    return out

@@ -1,10 +1,11 @@
-"""Train one run for every delay and seed, and evaluate all on the four seas.
+"""Train agents for every delay, all seeds of one in a single call, and evaluate them on four seas.
 
-    python experiments/sweep.py ppo|first-order [--integrator implicitfast] [--seeds N] [DELAY...]
+    python experiments/sweep.py ppo|first-order [--seeds N] [--quiet] [DELAY...] [-- TRAIN OPTIONS]
 
-Runs are kept in runs/ and gone on with if they are not finished. Writes experiments/ppo.csv or
-first_order.csv (with implicitfast: ..._quiet.csv): rows of `ik` and of the runs, for the delays
-named and those that the file has already.
+Runs are kept in runs/ under the names that `train` gives them (-quiet: the integrator implicitfast)
+and gone on with if they are not finished; one run a seed, as tools/sweep.sbatch makes them, does as
+well. Writes experiments/ppo.csv or first_order.csv (--quiet:
+..._quiet.csv): rows of `ik` and of every seed, for the delays named and those that the file has.
 """
 
 import csv
@@ -21,16 +22,26 @@ from mcx_jax.run_dir import CONFIG, stored_config
 DELAYS = ("E0", "B4_21", "E1", "B4_4", "E2")
 
 
-def trained(algo: str, delay: str, seed: int, quiet: bool) -> Path:
-    """A run, trained to its end."""
-    kind = "fast" if algo == "ppo" else algo
-    run = Path("runs") / f"{delay}-{kind}-s{seed}{'-quiet' if quiet else ''}"
-    command = [sys.executable, "-m", "mcx_jax.train", "--algo", algo, "--delay", delay]
-    command += ["--seed", str(seed), "--run-dir", str(run)]
-    command += ["--integrator", "implicitfast"] * quiet
+def trained(algo: str, delay: str, seeds: int, quiet: bool, options: list[str]) -> list[Path]:
+    """The runs of a delay, trained to their end."""
+    kind, tail = "fast" if algo == "ppo" else algo, "-quiet" if quiet else ""
+    single = [Path("runs") / f"{delay}-{kind}-s{seed}{tail}" for seed in range(seeds)]
+    if seeds == 1 or all((run / CONFIG).exists() for run in single):
+        return [finished(run, algo, delay, 1, quiet, options) for run in single]
+    together = Path("runs") / f"{delay}-{kind}-s0-{seeds - 1}{tail}"
+    return [finished(together, algo, delay, seeds, quiet, options)]
+
+
+def finished(run: Path, algo: str, delay: str, seeds: int, quiet: bool, options: list[str]) -> Path:
+    """A run, begun or gone on with if it has to be."""
+    command = [sys.executable, "-m", "mcx_jax.train", "--run-dir", str(run)]
     begun = (run / CONFIG).exists()
+    if begun:
+        command += ["--resume"]
+    else:
+        command += ["--algo", algo, "--delay", delay, "--seeds", str(seeds), *options]
+        command += ["--integrator", "implicitfast"] * quiet
     if not begun or latest(run) != stored_config(run).iterations:
-        command += ["--resume"] * begun
         print(" ".join(command), flush=True)
         subprocess.run(command, check=True)
     return run
@@ -46,15 +57,19 @@ def kept(name: str, delays: list[str]) -> list[dict]:
 
 
 def main() -> None:
-    words = sys.argv[1:]
-    algo, quiet = words[0], "implicitfast" in words
+    words, options = sys.argv[1:], []
+    if "--" in words:
+        words, options = words[: words.index("--")], words[words.index("--") + 1 :]
+    algo, quiet = words[0], "--quiet" in words
     seeds = int(words[words.index("--seeds") + 1]) if "--seeds" in words else 1
     delays = [word for word in words if word in DELAYS] or list(DELAYS)
-    runs = [trained(algo, delay, seed, quiet) for delay in delays for seed in range(seeds)]
+    runs = [trained(algo, delay, seeds, quiet, options) for delay in delays]
     startup.configure()
-    rows = [row for run in runs for row in run_rows(run)]
     name = algo.replace("-", "_") + ("_quiet" if quiet else "")
-    everything = kept(name, delays) + rows
+    everything = kept(name, delays)
+    for of_delay in runs:
+        for k, run in enumerate(of_delay):
+            everything += [row for row in run_rows(run) if row["who"] != "ik" or k == 0]
     everything.sort(key=lambda row: DELAYS.index(row["delay"]))
     write_rows(name, everything)
 

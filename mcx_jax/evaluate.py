@@ -205,9 +205,12 @@ def _effort_line(who: str, rows: list[dict[str, Any]]) -> str:
     most = {name: max(c[name] for c in corrections) for name in corrections[0]}
     share = max(r["torque_share"]["mean"] for r in rows)
     limited = max(r["torque_share"]["at_limit"] for r in rows)
+    far_mm, far_mrad, rate_mm_s, rate_mrad_s = (
+        10 * most[name] for name in ("max_cm", "max_crad", "rate_cm_s", "rate_crad_s")
+    )
     return (
-        f"{who}, worst sea: correction up to {most['max_cm']:.2f} cm {most['max_crad']:.2f} crad, "
-        f"mean rate {most['rate_cm_s']:.1f} cm/s {most['rate_crad_s']:.1f} crad/s; most loaded "
+        f"{who}, worst sea: correction up to {far_mm:.1f} mm {far_mrad:.1f} mrad, "
+        f"mean rate {rate_mm_s:.0f} mm/s {rate_mrad_s:.0f} mrad/s; most loaded "
         f"joint at {100 * share:.0f} % of its torque limit on average, {100 * limited:.1f} % of "
         "the steps at the limit"
     )
