@@ -1,6 +1,6 @@
-"""Regenerate the tables of README.md from the stored results.
+"""Regenerate the tables of README.md and of the site's pages from the stored results.
 
-    python experiments/readme_tables.py [--check]
+    python experiments/tables.py
 
 Each block stands between `<!-- table:NAME -->` and `<!-- end -->`.
 """
@@ -8,11 +8,11 @@ Each block stands between `<!-- table:NAME -->` and `<!-- end -->`.
 import csv
 import math
 import re
-import sys
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
-README = FOLDER.parent / "README.md"
+ROOT = FOLDER.parent
+PAGES = ("README.md", "docs/results.md", "docs/paper.md", "docs/task.md")
 SEAS = ("Wa", "Wb", "Wc", "Wd")
 DELAYS = ("E0", "B4_21", "E1", "B4_4", "E2")
 
@@ -72,9 +72,8 @@ def headline() -> str:
         rms = math.sqrt(sum(x * x for x in ratios) / len(ratios))
         worst = 100 * (math.exp(max(ratios, key=abs)) - 1)
         value = f"rms log ratio {rms:.3f}, worst cell {worst:+.0f} %"
-        rows.append(
-            ["IK baseline against table 3's implied one, 40 cells", value, source(cells[0])]
-        )
+        what = "IK baseline against table 3's implied one, 40 cells"
+        rows.append([what, value, f"`{cells[0]['command']}`"])
     for name, label in (("ppo", "PPO"), ("first_order", "gradient through the simulator")):
         stored = [r for r in over_seeds(name) if r["delay"] == "B4_4"]
         found = {(r["who"] == "ik", r["sea"]): r for r in stored}
@@ -87,7 +86,7 @@ def headline() -> str:
         one = found[False, "Wa"]
         what = f"{label}, delay B4_4, {int(one['steps']) / 1e6:.1f} M control steps"
         value = f"position error {min(gains):.0f} to {max(gains):.0f} % below the baseline's"
-        rows.append([what, value, source(one)])
+        rows.append([what, value, f"`{one['command']}`"])
     return markdown(["what", "here", "command"], rows)
 
 
@@ -287,7 +286,7 @@ TABLES = {
 
 
 def regenerate(text: str) -> str:
-    """README with every block made anew."""
+    """A page with every block made anew."""
 
     def block(match: re.Match[str]) -> str:
         return f"<!-- table:{match[1]} -->\n{TABLES[match[1]]()}\n<!-- end -->"
@@ -296,11 +295,9 @@ def regenerate(text: str) -> str:
 
 
 def main() -> None:
-    text = README.read_text()
-    new = regenerate(text)
-    if "--check" in sys.argv and new != text:
-        raise SystemExit("README.md's tables differ from the stored results: run this script")
-    README.write_text(new)
+    for page in PAGES:
+        path = ROOT / page
+        path.write_text(regenerate(path.read_text()))
 
 
 if __name__ == "__main__":
