@@ -36,6 +36,15 @@ def write_rows(name: str, rows: list[dict]) -> None:
     print(f"wrote {path.relative_to(FOLDER.parent)}")
 
 
+def kept(name: str, column: str, anew: list[str]) -> list[dict]:
+    """Rows that experiments/NAME.csv has already, but for those with a `column` made anew."""
+    path = FOLDER / f"{name}.csv"
+    if not path.is_file():
+        return []
+    with path.open(newline="") as file:
+        return [row for row in csv.DictReader(file) if row[column] not in anew]
+
+
 def evaluation_rows(rows: list[dict], seconds: float) -> list[dict]:
     """Result rows of `mcx_jax.evaluate` as CSV rows, beside the paper's figures; gains over the IK
     baseline of the worst 5 %, 1 % and the maximum in per cent."""

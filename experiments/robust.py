@@ -1,9 +1,9 @@
 """Controllers where the task is hard: noise, age of measurements, other delays, arms, loads, seas.
 
-    python experiments/robust.py RUN...
+    python experiments/robust.py WHO...
 
-RUN are trained policies (directories, .npz, shipped:robust), for B4_4 or several delays. Every
-condition is measured on the same windows of motion and goals, 24 episodes in each of the four seas;
+WHO are ik, extrapolate, extrapolate-best, fir, and trained policies (directories, .npz,
+shipped:robust) for B4_4 or several delays; the file's rows of others are kept. Every condition is measured on the same windows of motion and goals, 24 episodes in each of the four seas;
 one compiled program per controller runs all conditions. `extrapolate` and `fir` believe in B4_4
 throughout and know the age of measurements; the lead of `extrapolate-best` is found without
 disturbances, `fir` is fitted under the ranges of ANY and all DELAYS. Writes experiments/robust.csv.
@@ -17,7 +17,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from record import provenance, write_rows
+from record import kept, provenance, write_rows
 
 from mcx_jax import startup
 from mcx_jax.assets import SHIPPED
@@ -115,22 +115,34 @@ def measure(env, controller, gain: float, rows: list[Row]) -> list[dict]:
 
 
 run = jax.jit(run_episodes)
+FITTED = ("extrapolate-best", "fir")
+
+
+def controller_of(who: str):
+    """A controller by its name; what is fitted is fitted now."""
+    if who not in FITTED:
+        return CLASSICAL[who] if who in CLASSICAL else load_controller(who)[1]
+    train = task("all", False, "train")
+    if who == "extrapolate-best":
+        nominal = replace(
+            train.config, delay="B4_4", conditions=ConditionsConfig(), integrator="euler"
+        )
+        train = replace(train, config=nominal, integrator="euler")
+    return fitted(who, train)
+
+
+def order(who: str) -> int:
+    """Column of a controller: classical ones, then agents."""
+    known = ("ik", "extrapolate", *FITTED, "ppo", "first-order", "robust")
+    return known.index(who) if who in known else len(known)
 
 
 def main() -> None:
     startup.configure()
-    train = task("all", False, "train")
-    nominal = replace(train.config, delay="B4_4", conditions=ConditionsConfig(), integrator="euler")
-    plain = replace(train, config=nominal, integrator="euler")
-    controllers = {
-        "ik": (CLASSICAL["ik"], 0.0),
-        "extrapolate": (CLASSICAL["extrapolate"], 1.0),
-        "extrapolate-best": (fitted("extrapolate-best", plain), 1.0),
-        "fir": (fitted("fir", train), 1.0),
-    }
+    controllers = {}
     for who in sys.argv[1:]:
         name = Path(who.removeprefix(SHIPPED)).name.removesuffix(".npz")
-        controllers[name] = (load_controller(who)[1], 1.0)
+        controllers[name] = controller_of(who), float(who != "ik")
     found = []
     for who, (controller, gain) in controllers.items():
         begun = time.monotonic()
@@ -139,7 +151,10 @@ def main() -> None:
             measured = measure(task(sea, coupled, "test"), controller, gain, rows)
             found += [{"who": who, **row} for row in measured]
         print(f"{who}: {time.monotonic() - begun:.0f} s", flush=True)
-    write_rows("robust", [{**row, **provenance()} for row in found])
+    rows = [{**row, **provenance()} for row in found] + kept("robust", "who", list(controllers))
+    places = {row.name: i for i, row in enumerate(ROWS)}
+    rows.sort(key=lambda row: (order(row["who"]), places[row["condition"]]))
+    write_rows("robust", rows)
 
 
 if __name__ == "__main__":

@@ -8,12 +8,11 @@ well. Writes experiments/ppo.csv or first_order.csv (--quiet:
 ..._quiet.csv): rows of `ik` and of every seed, for the delays named and those that the file has.
 """
 
-import csv
 import subprocess
 import sys
 from pathlib import Path
 
-from record import FOLDER, run_rows, write_rows
+from record import kept, run_rows, write_rows
 
 from mcx_jax import startup
 from mcx_jax.checkpoint import latest
@@ -47,15 +46,6 @@ def finished(run: Path, algo: str, delay: str, seeds: int, quiet: bool, options:
     return run
 
 
-def kept(name: str, delays: list[str]) -> list[dict]:
-    """Rows of other delays that experiments/NAME.csv has."""
-    path = FOLDER / f"{name}.csv"
-    if not path.is_file():
-        return []
-    with path.open(newline="") as file:
-        return [row for row in csv.DictReader(file) if row["delay"] not in delays]
-
-
 def main() -> None:
     words, options = sys.argv[1:], []
     if "--" in words:
@@ -66,7 +56,7 @@ def main() -> None:
     runs = [trained(algo, delay, seeds, quiet, options) for delay in delays]
     startup.configure()
     name = algo.replace("-", "_") + ("_quiet" if quiet else "")
-    everything = kept(name, delays)
+    everything = kept(name, "delay", delays)
     for of_delay in runs:
         for k, run in enumerate(of_delay):
             everything += [row for row in run_rows(run) if row["who"] != "ik" or k == 0]
