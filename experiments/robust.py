@@ -3,10 +3,11 @@
     python experiments/robust.py WHO...
 
 WHO are ik, extrapolate, extrapolate-best, fir, and trained policies (directories, .npz,
-shipped:robust) for B4_4 or several delays; the file's rows of others are kept. Every condition is measured on the same windows of motion and goals, 24 episodes in each of the four seas;
-one compiled program per controller runs all conditions. `extrapolate` and `fir` believe in B4_4
-throughout and know the age of measurements; the lead of `extrapolate-best` is found without
-disturbances, `fir` is fitted under the ranges of ANY and all DELAYS. Writes experiments/robust.csv.
+shipped:robust) for B4_4 or several delays; the file's rows of others are kept. Every condition is
+measured on the same windows of motion and goals, 24 episodes in each of the four seas; one compiled
+program per controller runs all conditions. `extrapolate` and `fir` believe in B4_4 throughout and
+know the age of measurements; the lead of `extrapolate-best` is found without disturbances, `fir` is
+fitted under the ranges of ANY and all DELAYS. Writes experiments/robust.csv.
 """
 
 import sys
