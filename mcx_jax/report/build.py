@@ -2,6 +2,7 @@
 
 import json
 import shlex
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
@@ -16,6 +17,7 @@ from mcx_jax.evaluate import Errors, errors_beside_ik, evaluation_env, rows_besi
 from mcx_jax.report import sections, style
 from mcx_jax.report.entries import Entry, learning_curves
 from mcx_jax.report.episode import record
+from mcx_jax.report.noise import Sweep, noise_sweep
 from mcx_jax.report.page import page
 from mcx_jax.report.sections import Section
 from mcx_jax.report.spectra import motion_spectra
@@ -53,8 +55,11 @@ def build(
                 np.asarray(env.motion.knots_a), env.motion.seas, generated=not config.motion.motion
             )
         ),
-        # The noise sweep belongs here, once `evaluate` knows measurement noise.
     ]
+    swept: list[dict[str, Any]] = []
+    if config.noise_sweep:
+        section, swept = _noise_section(config, env, entries, rows, colours, say)
+        chapters.insert(-1, section)
     say("drawing")
     pngs = {p.name: style.png(p.figure) for chapter in chapters for p in chapter.panels}
     names = ", ".join(entry.label for entry in entries)
@@ -66,7 +71,8 @@ def build(
         pngs,
         facts := _facts(config, entries, argv),
     )
-    return html, pngs, {"made": facts, "rows": [row for part in rows.values() for row in part]}
+    every = [row for part in rows.values() for row in part]
+    return html, pngs, {"made": facts, "rows": every, "noise": swept}
 
 
 def _evaluate(config, env, entries: Sequence[Entry], say) -> tuple[dict[str, Errors], Rows]:
@@ -132,6 +138,22 @@ def _episode_sections(config, env, ik: Entry, shown, colours, say) -> list[Secti
     ]
 
 
+def _noise_section(config, env, entries: Sequence[Entry], rows: Rows, colours, say):
+    """(section, rows for results.json), in the sea where the baseline is worst."""
+    sea = int(np.argmax([row["pos_mm"]["mean"] for row in rows["ik"]]))
+    name = env.motion.seas[sea]
+    options = {"sea": sea, "episodes": config.episodes, "seed": config.seed}
+    sweeps: list[Sweep] = []
+    for entry in entries[1:] or entries:
+        begun = time.monotonic()
+        labels = tuple(dict.fromkeys(("ik", entry.label)))
+        both = noise_sweep(env, entry.controller, labels, **options)
+        sweeps += both if not sweeps else both[-1:]
+        say(f"measurement noise, {entry.label}: {time.monotonic() - begun:.0f} s")
+    section = sections.noise(sweeps, colours, name)
+    return section, [row for s in sweeps for row in s.rows(name)]
+
+
 def _learning_sections(config, entries: Sequence[Entry], rows: Rows, colours) -> list[Section]:
     runs, same = [], True
     for entry in entries:
@@ -163,5 +185,4 @@ def _facts(config, entries: Sequence[Entry], argv: Sequence[str]) -> dict[str, s
         "task": json.dumps(asdict(config.env)),
         "motion": json.dumps(asdict(config.motion)),
         "episodes": f"{config.episodes} a sea, seed {config.seed}; the first second is not counted",
-        "not here": "a sweep over measurement noise: python -m mcx_jax.evaluate has none yet",
     }

@@ -12,7 +12,9 @@ from mcx_jax.report import figures, style
 from mcx_jax.report.entries import Curves
 from mcx_jax.report.episode import Episode, lag_s
 from mcx_jax.report.figures import Line
+from mcx_jax.report.noise import Sweep
 from mcx_jax.report.spectra import CHANNELS, UNITS, Spectrum
+from mcx_jax.report.table import noise_table
 from mcx_jax.results import WARM_UP_STEPS, finite_episodes, paper_errors
 
 ZOOM_S = 0.6
@@ -109,6 +111,33 @@ def tracking(
         "reference would put the tool; solid: tool; the arrow: the tool's delay there and then. "
         f"In the titles ({', '.join(lags)}): the shift that fits the whole episode best, all "
         "three axes. Then: the errors over the whole episode.",
+    )
+
+
+def noise(sweeps: Sequence[Sweep], colours: dict[str, str], sea: str) -> Section:
+    """Mean errors against measurement noise, as a table and as curves."""
+    panels = []
+    for name, unit, field in (("dp", "mm", "pos_mm"), ("da", "mrad", "ang_mrad")):
+        curves = [
+            Line(s.label, colours[s.label], np.array(s.levels), getattr(s, field)) for s in sweeps
+        ]
+        drawn = figures.levels(
+            f"{'Position' if name == 'dp' else 'Orientation'} error, noisy measurement",
+            curves,
+            "noise, mm and mrad (standard deviation of each axis)",
+            f"mean {name}, {unit} (logarithmic)",
+        )
+        panels.append(Panel(f"noise_{name}", f"Mean {name} against measurement noise", drawn))
+    invalid = [f"{int(s.invalid.sum())} of {s.label}" for s in sweeps if s.invalid.any()]
+    return Section(
+        "Measurement noise",
+        panels,
+        f"Mean errors over the first {sweeps[0].episodes} of the episodes above in sea {sea}, the "
+        "goal's pose measured with white noise, new at every control step: so many mm along each "
+        "axis and as many mrad about each (standard deviations). The errors are the true ones, "
+        "tool to true goal. No controller is told of the noise."
+        + (f" Invalid episodes, counted all the same: {', '.join(invalid)}." if invalid else ""),
+        noise_table(sweeps),
     )
 
 
