@@ -27,6 +27,7 @@ from mcx_jax.report.__main__ import check_out, main
 from mcx_jax.report.episode import lag_s, record
 from mcx_jax.report.noise import noise_sweep
 from mcx_jax.report.spectra import motion_spectra
+from mcx_jax.report.table import table
 from mcx_jax.roster import load_controller
 
 STEPS, EPISODES, SEED = 90, 2, 3
@@ -136,10 +137,19 @@ def test_table_has_evaluates_numbers(made, html):
             assert f"{row[unit]['mean']:.2f} ± {row[unit]['std']:.2f}" in cells
     for group in ("all", "top5", "top1", "max"):
         assert f"{100 * both[1][0]['improvement']['pos'][group]:.0f}" in cells
+
+
+def test_the_papers_figures_stand_in_its_own_world_only(made, html):
     paper = table3()["E2", "Wb"]
+    rows = json.loads((made[0] / "results.json").read_text())["rows"]
+    cells = Page(table({"ik": rows[:1], "run": rows[1:]}, papers_world=True)).cells
     for name in ("pos_mm", "ang_mrad"):
         assert f"{paper[f'ik_{name}_implied']:.2f}" in cells
         assert f"{paper[f'{name}_mean']:.2f} ± {paper[f'{name}_std']:.2f}" in cells
+    # The report above is of the quiet integrator.
+    page = Page(html)
+    assert not [cell for cell in page.cells if "paper" in cell]
+    assert "The paper has no figures for this task" in page.text and "diamond" not in page.text
 
 
 def test_noise_sweep_has_evaluates_numbers(made, html):

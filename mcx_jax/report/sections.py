@@ -42,14 +42,15 @@ class Section:
     """HTML that goes in front of the caption."""
 
 
-def distributions(parts: Sequence[tuple[str, bool, Errors]]) -> Section:
+def distributions(parts: Sequence[tuple[str, bool, Errors]], papers_world: bool) -> Section:
     """Figure 4 of the paper for any controllers.
 
     Args:
         parts: (label, learned, errors) each.
+        papers_world: the paper's means belong beside them.
     """
     colours = style.colours([label for label, _, _ in parts])
-    panels = []
+    panels, diamonds = [], False
     for k, (name, unit) in enumerate((("dp", "mm"), ("da", "mrad"))):
         groups = []
         for i, sea in enumerate(parts[0][2].seas):
@@ -57,7 +58,9 @@ def distributions(parts: Sequence[tuple[str, bool, Errors]]) -> Section:
             for label, learned, e in parts:
                 inside = finite_episodes(e.pos_m[:, i], e.ang_rad[:, i])
                 points = 1e3 * (e.ang_rad if k else e.pos_m)[WARM_UP_STEPS:, i][:, inside]
-                paper = paper_errors(e.who, e.delay, sea) if learned or e.who == "ik" else None
+                compared = papers_world and (learned or e.who == "ik")
+                paper = paper_errors(e.who, e.delay, sea) if compared else None
+                diamonds |= paper is not None
                 group.append(figures.box(label, colours[label], points, paper and paper[k]))
             groups.append((sea, group))
         title = "Position error" if k == 0 else "Orientation error"
@@ -70,8 +73,12 @@ def distributions(parts: Sequence[tuple[str, bool, Errors]]) -> Section:
         panels,
         f"All points of {episodes} test episodes a sea after the first second, the same motion and "
         "goals for everyone. Box: the middle half of the points; line in it: median; whiskers: 5 % "
-        "to 95 %; dot and number: mean; open diamond: the paper's mean (table 3; for ik the "
-        "baseline that it implies). Figure 4 of the paper shows its baseline's errors in this way.",
+        "to 95 %; dot and number: mean"
+        + (
+            "; open diamond: the paper's mean (table 3; for ik the baseline that it implies)."
+            if diamonds
+            else "."
+        ),
     )
 
 

@@ -14,16 +14,17 @@ _GROUPS = ("all", "worst 5 %", "worst 1 %", "max")
 _UNITS = (("pos", "pos_mm", "dp, mm"), ("ang", "ang_mrad", "da, mrad"))
 
 
-def table(rows: dict[str, list[dict[str, Any]]]) -> str:
+def table(rows: dict[str, list[dict[str, Any]]], papers_world: bool) -> str:
     """The table.
 
     Args:
         rows: label -> result rows of `evaluate`, one a sea, the same seas for everyone.
+        papers_world: the paper's figures belong beside them.
     """
     body = []
     for i, first in enumerate(next(iter(rows.values()))):
         delay, sea = first["delay"], first["sea"]
-        published = table3().get((delay, sea))
+        published = table3().get((delay, sea)) if papers_world else None
         block = []
         for label, part in rows.items():
             block.append(_line(label, "", [_ours(part[i], *unit) for unit in _UNITS]))
