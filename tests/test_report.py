@@ -61,7 +61,7 @@ def made(tmp_path_factory):
     """(report directory, run directory): a run beside ik in two kinds of section."""
     folder = tmp_path_factory.mktemp("report")
     run = make_run(folder / "runs" / "E2-tiny-s0")
-    main([str(run), "--out", str(folder / "out"), "--sea", "Wb", *OPTIONS])
+    main([str(run), "--out", str(folder / "out"), "--sea", "Wb", "--noise-sweep", *OPTIONS])
     return folder / "out", run
 
 

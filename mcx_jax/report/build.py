@@ -183,7 +183,11 @@ def _facts(config, entries: Sequence[Entry], argv: Sequence[str]) -> dict[str, s
 
     packages = {**machine.versions(), "matplotlib": version("matplotlib")}
     metas = [(e, e.controller.policy.meta) for e in entries if e.learned]
-    policies = [f"{e.label} = {e.who}, iteration {m.iteration}, seed {m.seed}" for e, m in metas]
+    policies = [
+        f"{e.label if e.label == e.who else f'{e.label} = {e.who}'}, iteration {m.iteration}, "
+        f"seed {m.seed}"
+        for e, m in metas
+    ]
     return {
         "command": f"python -m mcx_jax.report {shlex.join(argv)}",
         "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),

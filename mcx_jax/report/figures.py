@@ -171,7 +171,7 @@ def levels(title: str, curves: Sequence[Line], xlabel: str, ylabel: str) -> Figu
     axes.xaxis.set_minor_locator(NullLocator())
     for curve in curves:
         axes.plot(curve.x, curve.y, "o-", color=curve.colour, ms=4, clip_on=False)
-    axes.set_xlim(at[0], at[-1])
+    axes.set_xlim(at[0], 1.08 * at[-1])  # room between the last dot and its label
     axes.set_xlabel(xlabel)
     axes.set_ylabel(ylabel)
     _plain_log(axes.yaxis)
