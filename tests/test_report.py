@@ -174,6 +174,15 @@ def test_noise_sweep_has_evaluates_numbers(made, html):
         assert {row["sea"] for row in stored["noise"]} == {"Wb"}
 
 
+def test_without_the_noise_sweep_nothing_of_an_earlier_one_is_left(made, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(made[0], out)
+    main([str(made[1]), "--out", str(out), "--sea", "Wb", *OPTIONS])
+    assert not list(out.glob("noise_*.png")) and (out / "torque.png").exists()
+    assert json.loads((out / "results.json").read_text())["noise"] == []
+    assert "Measurement noise" not in (out / "index.html").read_text(encoding="utf-8")
+
+
 def test_other_levels_of_noise_are_the_same_program():
     env = evaluation_env(TASK, MotionConfig(sea="Wb"))
     ik = load_controller("ik")[1]
