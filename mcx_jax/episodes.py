@@ -67,9 +67,15 @@ def episode_errors(env, controller, gains: tuple[float, ...], episodes: int, see
     keys = jnp.tile(jax.random.split(jax.random.key(seed), episodes), shape[0] * shape[1])
     seas = jnp.broadcast_to(jnp.arange(shape[1], dtype=jnp.int32)[:, None], shape).ravel()
     gain = jnp.broadcast_to(jnp.asarray(gains)[:, None, None], shape).ravel()
+    found = run_everywhere(env, controller, keys, seas, gain)
+    return tuple(x.reshape(*x.shape[:-1], *shape) for x in found)
+
+
+def run_everywhere(env, controller, keys, seas, gain, given=None):
+    """`run_episodes`, compiled, over all devices; returns NumPy arrays."""
     mesh = env_mesh(keys.size)
     env, controller = put(mesh, (env.replace(whole_batches=True), controller))
     keys, seas, gain = put(mesh, (keys, seas, gain), 0)
+    given = None if given is None else put(mesh, given, -1)
     with jax.set_mesh(mesh):
-        found = jax.device_get(_compiled()(env, controller, keys, seas, gain))
-    return tuple(x.reshape(*x.shape[:-1], *shape) for x in found)
+        return jax.device_get(_compiled()(env, controller, keys, seas, gain, given))

@@ -15,6 +15,7 @@ from mcx_jax.config import check_seed
 from mcx_jax.delay import parse_delay
 from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.errors import UserError
+from mcx_jax.paper import is_papers_world
 from mcx_jax.roster import fit_if_needed, informed, load_controller
 
 
@@ -168,29 +169,38 @@ def evaluate(
     )[1]
 
 
-def print_table(rows: list[dict[str, Any]], file=None) -> None:
-    """Print result rows as a table, beside the paper's where it has such a cell."""
+def print_table(rows: list[dict[str, Any]], file=None, *, papers_world: bool) -> None:
+    """Print result rows as a table.
+
+    Args:
+        papers_world: put table 3's means beside them, where it has such a delay and sea
+            (`mcx_jax.paper.is_papers_world`).
+    """
     from rich.console import Console
     from rich.table import Table
 
     from mcx_jax.results import paper_errors
 
+    published = [paper_errors(r["who"], r["delay"], r["sea"]) for r in rows]
+    beside = papers_world and any(published)
+    paper = ("paper",) if beside else ()
     table = Table(title=f"tracking error, delay {rows[0]['delay']}")
-    for name in ("who", "sea", "dp mm", "std", "top 5%", "top 1%", "max", "vs ik", "paper"):
+    for name in ("who", "sea", "dp mm", "std", "top 5%", "top 1%", "max", "vs ik", *paper):
         table.add_column(name, justify="left" if name in ("who", "sea") else "right")
-    for name in ("da mrad", "std", "max", "vs ik", "paper", "invalid"):
+    for name in ("da mrad", "std", "max", "vs ik", *paper, "invalid"):
         table.add_column(name, justify="right")
-    for r in rows:
+    for r, means in zip(rows, published, strict=True):
         p, a = r["pos_mm"], r["ang_mrad"]
-        published = paper_errors(r["who"], r["delay"], r["sea"])
+        papers = [(f"{x:.2f}",) for x in means] if means else [("-",), ("-",)]
+        pos_paper, ang_paper = papers if beside else ((), ())
         table.add_row(
             *(r["who"], r["sea"], f"{p['mean']:.3f}", f"{p['std']:.2f}"),
             *(f"{p['top5']:.2f}", f"{p['top1']:.2f}", f"{p['max']:.2f}"),
             f"{100 * r['improvement']['pos']['all']:.0f} %",
-            f"{published[0]:.2f}" if published else "-",
+            *pos_paper,
             *(f"{a['mean']:.3f}", f"{a['std']:.2f}", f"{a['max']:.2f}"),
             f"{100 * r['improvement']['ang']['all']:.0f} %",
-            f"{published[1]:.2f}" if published else "-",
+            *ang_paper,
             f"{r['invalid_episodes']}/{r['episodes']}",
         )
     console = Console(file=file, width=None if (file or sys.stdout).isatty() else 150)
@@ -233,7 +243,8 @@ def main(argv: list[str] | None = None) -> None:
     controller = fit_if_needed(who, controller, config.env, config.motion, config.known_delay)
     errors = errors_beside_ik(who, controller, env, episodes=config.episodes, seed=config.seed)
     baseline, rows = rows_beside_ik(errors)
-    print_table(rows if who == "ik" else baseline + rows, file=report)
+    ideal = is_papers_world(config.env, config.motion)
+    print_table(rows if who == "ik" else baseline + rows, report, papers_world=ideal)
     if quiet:
         print(json.dumps(rows, indent=1))
     elif config.json:

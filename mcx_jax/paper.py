@@ -2,8 +2,10 @@
 
 import csv
 import functools
+from dataclasses import replace
 
 from mcx_jax.assets import asset_path
+from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
 
 
 @functools.cache
@@ -17,3 +19,24 @@ def table3() -> dict[tuple[str, str], dict[str, float]]:
         }
         for row in rows
     }
+
+
+def is_papers_world(env: EnvConfig, motion: MotionConfig) -> bool:
+    """Whether the paper measured this task, so that table 3 may stand beside it.
+
+    That is every default: the arm `paper` with its tool and its integrator (Euler), a goal at rest,
+    ideal measurements, the arm's own masses, the bound of corrections, vessels in generated waves
+    that do not know of each other. Free are delay and sea, which `table3` looks up; the engine,
+    since both simulate the same; the number of steps; and how test motion is divided from training.
+    """
+    same = replace(
+        env,
+        delay=EnvConfig.delay,
+        physics=EnvConfig.physics,
+        episode_steps=EnvConfig.episode_steps,
+        integrator="model" if env.integrator == "euler" else env.integrator,
+        conditions=ConditionsConfig(),
+    )
+    ideal = env.conditions.ranges == ConditionsConfig().ranges  # however it is written
+    moved = replace(motion, sea=MotionConfig.sea, split=MotionConfig.split)
+    return ideal and same == EnvConfig() and moved == MotionConfig()

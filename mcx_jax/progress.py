@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, TextIO
 
 from mcx_jax.config import TrainConfig
+from mcx_jax.paper import is_papers_world
 from mcx_jax.results import paper_means
 
 PLAIN_INTERVAL_S = 10.0
@@ -27,11 +28,11 @@ def short_time(seconds: float) -> str:
 def references(config: TrainConfig) -> tuple[str, str]:
     """What to print beside dp and da: table 3's IK baseline and agents, for the seas of the run.
 
-    ("", "") where table 3 has none: another arm, delay, sea or motion.
+    ("", "") where table 3 has none: another delay or sea, or not the paper's world.
     """
     env, motion = config.env, config.motion
     ik, paper = (paper_means(who, env.delay, motion.sea) for who in ("ik", "paper"))
-    if ik is None or paper is None or env.arm != "paper" or motion.motion or motion.coupled:
+    if ik is None or paper is None or not is_papers_world(env, motion):
         return "", ""
     position, angle = (f" (IK {a:.2f}, paper {b:.2f})" for a, b in zip(ik, paper, strict=True))
     return position, angle

@@ -125,6 +125,7 @@ def final_table(config: TrainConfig, policy: "Policy", episodes: int, steps: int
         steps: control steps of an episode, whatever the length in training.
     """
     from mcx_jax.evaluate import evaluate_beside_ik, print_table
+    from mcx_jax.paper import is_papers_world
     from mcx_jax.policy import PolicyController
 
     named = config.motion.sea in ("all", "Wa", "Wb", "Wc", "Wd")
@@ -132,7 +133,7 @@ def final_table(config: TrainConfig, policy: "Policy", episodes: int, steps: int
     env = replace(config.env, episode_steps=steps)
     controller = PolicyController(policy)
     baseline, rows = evaluate_beside_ik("policy", controller, env, motion, episodes=episodes)
-    print_table(baseline + rows)
+    print_table(baseline + rows, papers_world=is_papers_world(env, motion))
 
 
 QUICK_COMPILE = "--xla_backend_optimization_level=0"

@@ -166,6 +166,22 @@ def test_refusals(tmp_path, monkeypatch):
     refused(["ik", "--frame", "a.png"], "play needs pillow: pip install 'mcx_jax[viz]'")
 
 
+def test_the_close_up_does_not_cover_the_tool():
+    """Goals all over vessel B's square, moved by as much as the roughest sea does."""
+    picture = pytest.importorskip("mcx_jax.play.picture")
+    model = Stage(TASK).model
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_camlight(model, data)
+    at_m, axes = data.camera("pair").xpos, data.camera("pair").xmat.reshape(3, 3)
+    x, y, z = np.meshgrid([0.45, 0.85], [-0.2, 0.2], [0.0, 0.45])
+    right, up, back = axes.T @ (np.stack([x.ravel(), y.ravel(), z.ravel()]) - at_m[:, None])
+    width = (picture.WIDTH_PX - picture.GAP_PX) / 2
+    half_fovy = math.radians(float(model.camera("pair").fovy[0]) / 2)
+    across_px = width / 2 + picture.PANEL_PX / 2 / math.tan(half_fovy) * right / -back
+    assert np.all(across_px < width - 10 - picture.CLOSE_UP_PX), across_px
+
+
 def test_no_opengl_is_one_line(monkeypatch):
     monkeypatch.setattr(gl, "_TRY", "raise SystemExit(1)")
     monkeypatch.setenv("MUJOCO_GL", "disable")

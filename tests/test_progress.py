@@ -13,7 +13,7 @@ from tensorboardX.proto.event_pb2 import Event, SessionLog
 
 from mcx_jax import startup
 from mcx_jax.config import preset_config
-from mcx_jax.env_config import EnvConfig, MotionConfig
+from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
 from mcx_jax.progress import Progress, references
 from mcx_jax.results import paper_means
 from mcx_jax.run_dir import open_existing, open_new
@@ -53,6 +53,8 @@ def test_means_over_the_seas():
         _config(coupled=True),
         _config(motion="waves.npy"),
         replace(FAST, env=EnvConfig(arm="ur10e", episode_steps=1024)),
+        replace(FAST, env=EnvConfig(integrator="mixed", episode_steps=1024)),
+        replace(FAST, env=EnvConfig(episode_steps=1024, conditions=ConditionsConfig("0:3"))),
     ],
 )
 def test_no_reference_where_table_3_has_none(config):

@@ -12,9 +12,9 @@ import jax
 import numpy as np
 import pytest
 
-from mcx_jax import cli
+from mcx_jax import cli, episodes
 from mcx_jax.config import TrainConfig
-from mcx_jax.env_config import EnvConfig, MotionConfig
+from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
 from mcx_jax.envs.model import torque_limits_nm
 from mcx_jax.errors import UserError
 from mcx_jax.evaluate import errors_beside_ik, evaluate_beside_ik, evaluation_env
@@ -25,7 +25,9 @@ from mcx_jax.ppo.normalise import init_stats
 from mcx_jax.report import entries, style
 from mcx_jax.report.__main__ import check_out, main
 from mcx_jax.report.episode import lag_s, record
+from mcx_jax.report.noise import noise_sweep
 from mcx_jax.report.spectra import motion_spectra
+from mcx_jax.report.table import table
 from mcx_jax.roster import load_controller
 
 STEPS, EPISODES, SEED = 90, 2, 3
@@ -59,7 +61,7 @@ def made(tmp_path_factory):
     """(report directory, run directory): a run beside ik in two kinds of section."""
     folder = tmp_path_factory.mktemp("report")
     run = make_run(folder / "runs" / "E2-tiny-s0")
-    main([str(run), "--out", str(folder / "out"), "--sea", "Wb", *OPTIONS])
+    main([str(run), "--out", str(folder / "out"), "--sea", "Wb", "--noise-sweep", *OPTIONS])
     return folder / "out", run
 
 
@@ -103,7 +105,7 @@ def test_page_parses_and_holds_every_figure(made, html):
     out = made[0]
     pngs = sorted(path.name for path in out.glob("*.png"))
     wanted = ("errors_dp", "errors_da", "follow_0", "follow_1", "episode_dp", "episode_da")
-    wanted += ("correction_translation", "correction_rotation", "torque")
+    wanted += ("correction_translation", "correction_rotation", "torque", "noise_dp", "noise_da")
     wanted += tuple(f"learning_{e}_{x}" for e in ("dp", "da") for x in ("steps", "wall"))
     wanted += tuple(f"spectrum_{c}" for c in ("surge", "sway", "heave", "roll", "pitch", "yaw"))
     assert pngs == sorted(f"{name}.png" for name in wanted)
@@ -135,10 +137,60 @@ def test_table_has_evaluates_numbers(made, html):
             assert f"{row[unit]['mean']:.2f} ± {row[unit]['std']:.2f}" in cells
     for group in ("all", "top5", "top1", "max"):
         assert f"{100 * both[1][0]['improvement']['pos'][group]:.0f}" in cells
+
+
+def test_the_papers_figures_stand_in_its_own_world_only(made, html):
     paper = table3()["E2", "Wb"]
+    rows = json.loads((made[0] / "results.json").read_text())["rows"]
+    cells = Page(table({"ik": rows[:1], "run": rows[1:]}, papers_world=True)).cells
     for name in ("pos_mm", "ang_mrad"):
         assert f"{paper[f'ik_{name}_implied']:.2f}" in cells
         assert f"{paper[f'{name}_mean']:.2f} ± {paper[f'{name}_std']:.2f}" in cells
+    # The report above is of the quiet integrator.
+    page = Page(html)
+    assert not [cell for cell in page.cells if "paper" in cell]
+    assert "The paper has no figures for this task" in page.text and "diamond" not in page.text
+
+
+def test_noise_sweep_has_evaluates_numbers(made, html):
+    """A level of the sweep is `evaluate --noise-mm X --noise-mrad X`: the same noise, to the digit;
+    the level 0 is the table above it."""
+    out, run = made
+    stored = json.loads((out / "results.json").read_text())
+    swept = {(row["who"], row["noise_mm"]): row for row in stored["noise"]}
+    assert [level for who, level in swept if who == "ik"] == [0, 0.3, 1, 3]
+    noisy = dataclasses.replace(TASK, conditions=ConditionsConfig(noise_mm="1", noise_mrad="1"))
+    who, controller = load_controller(str(run))
+    ideal = [row for row in stored["rows"] if row["sea"] == "Wb"]
+    at_1 = evaluate_beside_ik(
+        who, controller, noisy, MotionConfig(sea="Wb"), episodes=EPISODES, seed=SEED
+    )
+    for name, clean, (row,) in zip(("ik", "tiny-s0"), ideal, at_1, strict=True):
+        for unit in ("pos_mm", "ang_mrad"):
+            assert swept[name, 0][unit] == pytest.approx(clean[unit]["mean"], abs=2e-3)
+            assert swept[name, 1][unit] == pytest.approx(row[unit]["mean"], abs=2e-3)
+            assert swept[name, 3][unit] > swept[name, 0][unit] + 0.05
+            assert f"{swept[name, 0.3][unit]:.2f}" in Page(html).cells
+        assert {row["sea"] for row in stored["noise"]} == {"Wb"}
+
+
+def test_without_the_noise_sweep_nothing_of_an_earlier_one_is_left(made, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(made[0], out)
+    main([str(made[1]), "--out", str(out), "--sea", "Wb", *OPTIONS])
+    assert not list(out.glob("noise_*.png")) and (out / "torque.png").exists()
+    assert json.loads((out / "results.json").read_text())["noise"] == []
+    assert "Measurement noise" not in (out / "index.html").read_text(encoding="utf-8")
+
+
+def test_other_levels_of_noise_are_the_same_program():
+    env = evaluation_env(TASK, MotionConfig(sea="Wb"))
+    ik = load_controller("ik")[1]
+    (first,) = noise_sweep(env, ik, ("ik",), sea=0, episodes=1, seed=0, levels=(0, 1))
+    before = episodes._compiled()._cache_size()
+    (second,) = noise_sweep(env, ik, ("ik",), sea=0, episodes=1, seed=1, levels=(0, 20))
+    assert episodes._compiled()._cache_size() == before
+    assert second.pos_mm[1] > 1.5 * second.pos_mm[0] and first.pos_mm[1] < 2 * first.pos_mm[0]
 
 
 def test_recorded_episode_is_evaluates(made):

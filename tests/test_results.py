@@ -5,7 +5,8 @@ import pytest
 import scipy.stats
 
 from mcx_jax import results
-from mcx_jax.paper import table3
+from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
+from mcx_jax.paper import is_papers_world, table3
 from mcx_jax.results import WARM_UP_STEPS, bootstrap_interval, effort, interquartile_mean
 
 SEAS, DELAYS = ("Wa", "Wb", "Wc", "Wd"), ("E0", "E1", "E2", "B4_21", "B4_4")
@@ -94,6 +95,31 @@ def test_table3_by_hand():
     assert results.paper_errors("ik", "B4_4", "Wd") == (8.08, 5.39)
     assert results.paper_errors("ik", "E7", "Wa") is None
     assert results.paper_errors("ik", "E0", "1.5:8") is None
+
+
+IDEAL = [
+    (EnvConfig(), MotionConfig()),
+    (EnvConfig("E1", physics="mjx", integrator="euler", episode_steps=70), MotionConfig("Wa")),
+    (EnvConfig(conditions=ConditionsConfig(noise_mm="0:0", payload_kg="0.0")), MotionConfig()),
+    (EnvConfig(), MotionConfig("3.0:11", split="paper")),  # table 3 has no such sea
+]
+OTHERS = [
+    *({"arm": "ur10e"}, {"arm": "docs/seven.xml"}, {"tool_site": "gripper"}, {"goal": "circle"}),
+    *({"integrator": "implicitfast"}, {"integrator": "mixed"}, {"max_correction": 1.0}),
+]
+DISTURBED = ("noise_mm", "noise_mrad", "latency_steps", "payload_kg")
+
+
+def test_where_table3_holds():
+    for env, motion in IDEAL:
+        assert is_papers_world(env, motion), (env, motion)
+    for change in OTHERS:
+        assert not is_papers_world(EnvConfig(**change), MotionConfig()), change
+    for change in [*({name: "0:2"} for name in DISTURBED), {"wrist_inertia": "0.5"}]:
+        env = EnvConfig(conditions=ConditionsConfig(**change))
+        assert not is_papers_world(env, MotionConfig()), change
+    for motion in (MotionConfig(coupled=True), MotionConfig(motion="waves.npy")):
+        assert not is_papers_world(EnvConfig(), motion), motion
 
 
 def test_paper_errors_grow_with_the_sea():

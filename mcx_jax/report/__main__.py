@@ -36,6 +36,8 @@ class ReportConfig:
     """Seed of the episodes' windows and goals, as in evaluate."""
     show: int = 0
     """Which of the episodes (0, 1, ...) is drawn over time, in the last sea."""
+    noise_sweep: bool = False
+    """Errors against measurement noise too: half a minute for each controller, to compile."""
     device: Literal["auto", "cpu", "gpu"] = "auto"
     """Where to run; auto = GPU if JAX has one."""
     env: EnvConfig = field(default_factory=EnvConfig)

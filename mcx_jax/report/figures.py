@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, MaxNLocator, NullFormatter, NullLocator
 
 from mcx_jax.report import style
 
@@ -156,6 +156,26 @@ def lines(
     else:
         axes.set_ylim(bottom=0.0)
     style.label_right(figure, axes, labels, 8.5)
+    return figure
+
+
+@style.styled
+def levels(title: str, curves: Sequence[Line], xlabel: str, ylabel: str) -> Figure:
+    """Curves over a few levels from 0 up, a dot each; logarithmic but for the step from 0."""
+    figure, axes = style.panel(title)
+    at = curves[0].x
+    axes.set_yscale("log")
+    # From 0 to the first level as far as a factor of three.
+    axes.set_xscale("symlog", linthresh=at[1], linscale=0.5)
+    axes.set_xticks(at, [f"{x:g}" for x in at])
+    axes.xaxis.set_minor_locator(NullLocator())
+    for curve in curves:
+        axes.plot(curve.x, curve.y, "o-", color=curve.colour, ms=4, clip_on=False)
+    axes.set_xlim(at[0], 1.08 * at[-1])  # room between the last dot and its label
+    axes.set_xlabel(xlabel)
+    axes.set_ylabel(ylabel)
+    _plain_log(axes.yaxis)
+    style.label_right(figure, axes, [(c.label, c.colour, float(c.y[-1])) for c in curves], 8.5)
     return figure
 
 

@@ -12,7 +12,9 @@ from mcx_jax.report import figures, style
 from mcx_jax.report.entries import Curves
 from mcx_jax.report.episode import Episode, lag_s
 from mcx_jax.report.figures import Line
+from mcx_jax.report.noise import Sweep
 from mcx_jax.report.spectra import CHANNELS, UNITS, Spectrum
+from mcx_jax.report.table import noise_table
 from mcx_jax.results import WARM_UP_STEPS, finite_episodes, paper_errors
 
 ZOOM_S = 0.6
@@ -40,14 +42,15 @@ class Section:
     """HTML that goes in front of the caption."""
 
 
-def distributions(parts: Sequence[tuple[str, bool, Errors]]) -> Section:
+def distributions(parts: Sequence[tuple[str, bool, Errors]], papers_world: bool) -> Section:
     """Figure 4 of the paper for any controllers.
 
     Args:
         parts: (label, learned, errors) each.
+        papers_world: the paper's means belong beside them.
     """
     colours = style.colours([label for label, _, _ in parts])
-    panels = []
+    panels, diamonds = [], False
     for k, (name, unit) in enumerate((("dp", "mm"), ("da", "mrad"))):
         groups = []
         for i, sea in enumerate(parts[0][2].seas):
@@ -55,7 +58,9 @@ def distributions(parts: Sequence[tuple[str, bool, Errors]]) -> Section:
             for label, learned, e in parts:
                 inside = finite_episodes(e.pos_m[:, i], e.ang_rad[:, i])
                 points = 1e3 * (e.ang_rad if k else e.pos_m)[WARM_UP_STEPS:, i][:, inside]
-                paper = paper_errors(e.who, e.delay, sea) if learned or e.who == "ik" else None
+                compared = papers_world and (learned or e.who == "ik")
+                paper = paper_errors(e.who, e.delay, sea) if compared else None
+                diamonds |= paper is not None
                 group.append(figures.box(label, colours[label], points, paper and paper[k]))
             groups.append((sea, group))
         title = "Position error" if k == 0 else "Orientation error"
@@ -68,8 +73,12 @@ def distributions(parts: Sequence[tuple[str, bool, Errors]]) -> Section:
         panels,
         f"All points of {episodes} test episodes a sea after the first second, the same motion and "
         "goals for everyone. Box: the middle half of the points; line in it: median; whiskers: 5 % "
-        "to 95 %; dot and number: mean; open diamond: the paper's mean (table 3; for ik the "
-        "baseline that it implies). Figure 4 of the paper shows its baseline's errors in this way.",
+        "to 95 %; dot and number: mean"
+        + (
+            "; open diamond: the paper's mean (table 3; for ik the baseline that it implies)."
+            if diamonds
+            else "."
+        ),
     )
 
 
@@ -109,6 +118,33 @@ def tracking(
         "reference would put the tool; solid: tool; the arrow: the tool's delay there and then. "
         f"In the titles ({', '.join(lags)}): the shift that fits the whole episode best, all "
         "three axes. Then: the errors over the whole episode.",
+    )
+
+
+def noise(sweeps: Sequence[Sweep], colours: dict[str, str], sea: str) -> Section:
+    """Mean errors against measurement noise, as a table and as curves."""
+    panels = []
+    for name, unit, field in (("dp", "mm", "pos_mm"), ("da", "mrad", "ang_mrad")):
+        curves = [
+            Line(s.label, colours[s.label], np.array(s.levels), getattr(s, field)) for s in sweeps
+        ]
+        drawn = figures.levels(
+            f"{'Position' if name == 'dp' else 'Orientation'} error, noisy measurement",
+            curves,
+            "noise, mm and mrad (standard deviation of each axis)",
+            f"mean {name}, {unit} (logarithmic)",
+        )
+        panels.append(Panel(f"noise_{name}", f"Mean {name} against measurement noise", drawn))
+    invalid = [f"{int(s.invalid.sum())} of {s.label}" for s in sweeps if s.invalid.any()]
+    return Section(
+        "Measurement noise",
+        panels,
+        f"Mean errors over the first {sweeps[0].episodes} of the episodes above in sea {sea}, the "
+        "goal's pose measured with white noise, new at every control step: so many mm along each "
+        "axis and as many mrad about each (standard deviations). The errors are the true ones, "
+        "tool to true goal. No controller is told of the noise."
+        + (f" Invalid episodes, counted all the same: {', '.join(invalid)}." if invalid else ""),
+        noise_table(sweeps),
     )
 
 

@@ -4,23 +4,27 @@ from collections.abc import Sequence
 from html import escape
 from typing import Any
 
+import numpy as np
+
 from mcx_jax.paper import table3
+from mcx_jax.report.noise import Sweep
 from mcx_jax.results import GROUPS
 
 _GROUPS = ("all", "worst 5 %", "worst 1 %", "max")
 _UNITS = (("pos", "pos_mm", "dp, mm"), ("ang", "ang_mrad", "da, mrad"))
 
 
-def table(rows: dict[str, list[dict[str, Any]]]) -> str:
+def table(rows: dict[str, list[dict[str, Any]]], papers_world: bool) -> str:
     """The table.
 
     Args:
         rows: label -> result rows of `evaluate`, one a sea, the same seas for everyone.
+        papers_world: the paper's figures belong beside them.
     """
     body = []
     for i, first in enumerate(next(iter(rows.values()))):
         delay, sea = first["delay"], first["sea"]
-        published = table3().get((delay, sea))
+        published = table3().get((delay, sea)) if papers_world else None
         block = []
         for label, part in rows.items():
             block.append(_line(label, "", [_ours(part[i], *unit) for unit in _UNITS]))
@@ -45,6 +49,31 @@ def table(rows: dict[str, list[dict[str, Any]]]) -> str:
         + "".join(f"<th>{name}</th>" for name in _GROUPS) * 2
         + f"</tr></thead>{''.join(body)}</table></div>"
     )
+
+
+def noise_table(sweeps: Sequence[Sweep]) -> str:
+    """Mean errors of every controller at every level of noise."""
+    levels = sweeps[0].levels
+    body = [
+        _line(s.label, "", [[_number(x) for x in values] for values in (s.pos_mm, s.ang_mrad)])
+        for s in sweeps
+    ]
+    heads = "".join(
+        f'<th class="part">{levels[0]:g}</th>' + "".join(f"<th>{x:g}</th>" for x in levels[1:])
+        for _ in _UNITS
+    )
+    parts = "".join(
+        f'<th colspan="{len(levels)}" class="part">{name}, at a noise of … mm and mrad</th>'
+        for _, _, name in _UNITS
+    )
+    return (
+        f'<div class="wide"><table><thead><tr><th rowspan="2">controller</th>{parts}</tr>'
+        f"<tr>{heads}</tr></thead><tbody>{''.join(body)}</tbody></table></div>"
+    )
+
+
+def _number(value: float) -> str:
+    return f"{value:.2f}" if np.isfinite(value) else "diverged"
 
 
 def _line(label: str, kind: str, units: Sequence[Sequence[str]]) -> str:
