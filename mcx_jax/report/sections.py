@@ -142,7 +142,7 @@ def noise(sweeps: Sequence[Sweep], colours: dict[str, str], sea: str) -> Section
         f"Mean errors over the first {sweeps[0].episodes} of the episodes above in sea {sea}, the "
         "goal's pose measured with white noise, new at every control step: so many mm along each "
         "axis and as many mrad about each (standard deviations). The errors are the true ones, "
-        "tool to true goal. No controller is told of the noise."
+        "tool to true goal. No controller is told of the noise, which replaces the task's."
         + (f" Invalid episodes, counted all the same: {', '.join(invalid)}." if invalid else ""),
         noise_table(sweeps),
     )
