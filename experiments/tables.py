@@ -185,7 +185,28 @@ def robust() -> str:
         for row in [[cells[what, who] for who in whos]]
     ]
     table = markdown(["mm, mrad", *whos], rows)
-    return table + "\n\nSource: " + source(stored[0])
+    said = [f"`robust` is better in both errors than {_lead(cells, r)}." for r in RIVALS]
+    sources = dict.fromkeys(source(r) for r in stored)
+    return "\n\n".join([table, " ".join(said), "Source: " + "; ".join(sources)])
+
+
+RIVALS = (("extrapolate",), ("ik", "extrapolate", "extrapolate-best", "fir"))
+
+
+def _lead(cells: dict[tuple[str, str], dict[str, str]], rivals: tuple[str, ...]) -> str:
+    """Against whom, in how many conditions, and where not."""
+    names = dict.fromkeys(what for what, _ in cells)
+
+    def behind(what: str) -> bool:
+        return any(
+            float(cells[what, "robust"][unit]) >= min(float(cells[what, r][unit]) for r in rivals)
+            for unit in ("pos_mm", "ang_mrad")
+        )
+
+    lost = [what for what in names if behind(what)]
+    against = f"`{rivals[0]}`" if len(rivals) == 1 else "the best controller without learning"
+    found = f"{against} in {len(names) - len(lost)} of {len(names)} conditions"
+    return found + (f", not in: {'; '.join(lost)}" if lost else "")
 
 
 def _below_paper(cell: dict[str, str]) -> list[str]:
