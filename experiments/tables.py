@@ -12,7 +12,7 @@ from pathlib import Path
 
 FOLDER = Path(__file__).parent
 ROOT = FOLDER.parent
-PAGES = ("README.md", "docs/results.md", "docs/paper.md", "docs/task.md")
+PAGES = ("README.md", "docs/results.md", "docs/paper.md", "docs/task.md", "docs/cluster.md")
 SEAS = ("Wa", "Wb", "Wc", "Wd")
 DELAYS = ("E0", "B4_21", "E1", "B4_4", "E2")
 
@@ -263,6 +263,24 @@ def speed() -> str:
     return markdown(["what", "here"], rows) + "\n\nSource: " + source(stored[0])
 
 
+def scaling() -> str:
+    """Training with as many environments a device, on more and more devices."""
+    stored = read("scaling")
+    if not stored:
+        return "not measured yet (`python experiments/scaling.py`)"
+    rows = [
+        [
+            f"{r['processes']} x {r['devices_each']}",
+            r["num_envs"],
+            f"{float(r['steps_per_s']) / 1e3:.1f} k",
+            f"{r['share_of_linear_percent']} %",
+        ]
+        for r in stored
+    ]
+    header = ["processes x devices", "environments", "control steps/s", "of cores x the first row"]
+    return markdown(header, rows) + "\n\nSource: " + source(stored[0])
+
+
 def observation() -> str:
     """The observation's table, from the code."""
     from mcx_jax.envs.observe import OBS_TABLE
@@ -301,6 +319,7 @@ TABLES = {
     "agents": agents,
     "robust": robust,
     "speed": speed,
+    "scaling": scaling,
     "observation": observation,
     "presets": presets,
 }
