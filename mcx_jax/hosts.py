@@ -8,7 +8,9 @@ and who loses a partner stops. Every process needs to see the run's directory.
 import contextlib
 import os
 import re
+import socket
 import sys
+import time
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
@@ -49,22 +51,54 @@ def join(text: str) -> None:
         return
     import jax
 
-    place = PLACE.fullmatch(text)
     try:
-        if place:
-            jax.distributed.initialize(
-                place["coordinator"],
-                int(place["count"]),
-                int(place["index"]),
-                initialization_timeout=WAIT_S,
-            )
+        if place := PLACE.fullmatch(text):
+            coordinator, count, index = place["coordinator"], place["count"], place["index"]
+            meet(coordinator, int(count), int(index), WAIT_S)
+            jax.distributed.initialize(coordinator, int(count), int(index))
         else:
-            jax.distributed.initialize(initialization_timeout=WAIT_S)
-    except (RuntimeError, ValueError) as error:
+            jax.distributed.initialize()
+    except (OSError, RuntimeError, ValueError) as error:
         reason = str(error).strip().splitlines()[0][:200]
         raise UserError(f"--distributed {text}: the processes did not meet ({reason})") from None
     if not first():
         contextlib.redirect_stdout(open(os.devnull, "w")).__enter__()  # for good
+
+
+def meet(coordinator: str, count: int, index: int, wait_s: float) -> None:
+    """Return when all processes have come, on the port that JAX will use: it would abort the
+    process, with a stack, where one is missing.
+
+    Raises:
+        OSError: they have not all come in time, or the port cannot be used.
+    """
+    host, _, port = coordinator.rpartition(":")
+    until = time.monotonic() + wait_s
+    if index:
+        while True:
+            try:
+                with socket.create_connection((host.strip("[]"), int(port)), wait_s) as server:
+                    server.settimeout(max(until - time.monotonic(), 0.1))
+                    if server.recv(1):
+                        return
+                raise OSError(f"process 0 at {coordinator} has given up")
+            except ConnectionError:  # it is not there yet
+                if time.monotonic() > until:
+                    raise OSError(f"nobody listens at {coordinator} after {wait_s:g} s") from None
+                time.sleep(0.2)
+    with contextlib.ExitStack() as stack:
+        server = stack.enter_context(socket.create_server(("", int(port))))
+        come: list[socket.socket] = []
+        while len(come) < count - 1:
+            server.settimeout(max(until - time.monotonic(), 0.01))
+            try:
+                come.append(stack.enter_context(server.accept()[0]))
+            except TimeoutError:
+                missing = count - 1 - len(come)
+                raise OSError(f"{missing} of {count} are missing after {wait_s:g} s") from None
+        server.close()
+        for other in come:
+            other.sendall(b"1")
 
 
 def first() -> bool:

@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -138,6 +139,28 @@ def test_places_that_cannot_be_meant(text):
         hosts.check(text)
     for good in ("", "auto", "node-1.cluster:1234,0/2", "[::1]:1234,7/8"):
         hosts.check(good)
+
+
+def test_a_partner_that_never_comes():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        place = f"127.0.0.1:{free.getsockname()[1]}"
+    with pytest.raises(OSError, match="1 of 2 are missing after 0.3 s"):
+        hosts.meet(place, 2, 0, 0.3)
+    with pytest.raises(OSError, match=f"nobody listens at {place} after 0.3 s"):
+        hosts.meet(place, 2, 1, 0.3)
+
+
+def test_partners_that_come_late():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        place = f"127.0.0.1:{free.getsockname()[1]}"
+    with ThreadPoolExecutor(3) as pool:
+        others = [pool.submit(hosts.meet, place, 3, i, 20.0) for i in (1, 2)]
+        time.sleep(0.5)
+        hosts.meet(place, 3, 0, 20.0)
+        for other in others:
+            other.result()
 
 
 def test_auto_needs_a_cluster(repo_root, place):
