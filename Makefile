@@ -4,7 +4,6 @@
 DELAY    ?= B4_4
 NUM_ENVS ?= 2048
 ARGS     ?=
-WORKERS  ?= 2
 
 # 3.11 first: constraints.txt was made with it. A shim that exists but does not run is passed over.
 PYTHON ?= $(firstword $(foreach p,python3.11 python3.12 python3.13 python3,\
@@ -29,8 +28,8 @@ train: $(VENV)/.run  ## train an agent for DELAY, ending with its table beside b
 bench: $(VENV)/.run  ## how fast everything is here, rivals included; let nothing else run
 	$(PY) -m mcx_jax.bench $(ARGS)
 
-test: check  ## lint, format, types, then the tests but the slow ones, two files at a time
-	$(PY) -m pytest -n $(WORKERS) --dist loadfile -m "not slow" $(ARGS)
+test: check  ## lint, format, types, then the tests but the slow ones, cheap ones first
+	$(PY) -m pytest -m "not slow" $(ARGS)
 
 test-slow: $(VENV)/.dev  ## the slow ones: runs killed 24 times, own data and own arm from end to end
 	$(PY) -m pytest -m slow $(ARGS)
