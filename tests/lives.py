@@ -68,13 +68,14 @@ def die_at(event: int, run: Path) -> None:
     sys.addaudithook(hook)
 
 
-def term_after(iteration: int) -> None:
+def signal_after(iteration: int, signum: int = signal.SIGTERM) -> None:
+    """A signal to this process after an iteration."""
     show = Progress.show
 
     def show_and_stop(self, rows):
         show(self, rows)
         if rows[0]["iteration"] == iteration:
-            os.kill(os.getpid(), signal.SIGTERM)
+            os.kill(os.getpid(), signum)
 
     Progress.show = show_and_stop
 
@@ -84,7 +85,7 @@ def live(run: Path, kind: str, value: str) -> None:
     if kind == "event":
         die_at(int(value), run)
     if kind == "term":
-        term_after(int(value))
+        signal_after(int(value))
     begun = (run / CONFIG).exists()
     opened = (open_existing if begun else open_new)(run, RUN_CONFIG)
     train(opened, make_env, checkpoint_interval_s=60.0 if kind == "end" else 0.0)

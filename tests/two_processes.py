@@ -1,4 +1,5 @@
-"""One process of several that train a run: `python two_processes.py RUN PLACE`."""
+"""One process of several that train a run: `python two_processes.py RUN PLACE [SIGNAL ITERATION]`,
+which it sends to itself after that iteration."""
 
 import sys
 from pathlib import Path
@@ -12,6 +13,8 @@ from mcx_jax.training import train
 
 def main() -> None:
     run, place = Path(sys.argv[1]), sys.argv[2]
+    if sys.argv[3:]:
+        lives.signal_after(int(sys.argv[4]), int(sys.argv[3]))
     begun = (run / CONFIG).exists()
     opened = (open_existing if begun else open_new)(run, lives.RUN_CONFIG)
     hosts.join(place)
