@@ -127,16 +127,13 @@ def agree(*numbers: int) -> tuple[int, ...]:
 
 
 def whole(arrays: dict[str, Any]) -> dict[str, Any]:
-    """The arrays with the parts of all processes, on the host, which all have to call this; in one
-    process as they are."""
-    if alone():
-        return arrays
+    """The arrays with the parts of all processes, as NumPy's; all processes have to call this."""
     import jax
     import numpy as np
     from jax.experimental import multihost_utils
 
     def gather(x: Any) -> Any:
-        if x.is_fully_replicated:
+        if alone() or x.is_fully_replicated:
             return np.asarray(jax.device_get(x))
         return multihost_utils.process_allgather(x, tiled=True)
 

@@ -3,6 +3,7 @@
 Every exported form carries or follows this one description (`python -m mcx_jax.export`).
 """
 
+import functools
 import json
 from typing import Any
 
@@ -57,6 +58,7 @@ def describe(net: PolicyNet, obs_size: int, config: str) -> dict[str, Any]:
     }
 
 
+@functools.cache  # every checkpoint of a run asks, and a lambda is traced anew each time
 def state_sizes(net: PolicyNet) -> dict[str, int]:
     """Length of each array of the memory by its name, in the order of the carry's leaves."""
     leaves, _ = jax.tree.flatten_with_path(jax.eval_shape(lambda: init_carry(net, ())))

@@ -9,6 +9,7 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -170,6 +171,6 @@ def test_devices_of_several_processes_must_share_evenly():
 def test_one_process_agrees_with_itself():
     assert hosts.first() and hosts.alone()
     assert hosts.agree(3, 0) == (3, 0)
-    arrays = {"a": np.zeros(3)}
-    assert hosts.whole(arrays) is arrays
+    found = hosts.whole({"a": jnp.arange(3)})
+    assert type(found["a"]) is np.ndarray and list(found["a"]) == [0, 1, 2]
     hosts.part()

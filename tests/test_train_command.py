@@ -23,7 +23,7 @@ from mcx_jax.errors import UserError
 from mcx_jax.policy import load_policy
 from mcx_jax.programs import prepare
 from mcx_jax.progress import Progress, short_time
-from mcx_jax.run_dir import default_path, open_existing, open_new
+from mcx_jax.run_dir import RunDir, default_path, open_existing, open_new
 from mcx_jax.stop import StopRequest
 from mcx_jax.train import compile_quickly, main, read_command
 from mcx_jax.training import train
@@ -336,3 +336,21 @@ def test_smoke_runs_the_whole_path(tmp_path):
     seas = ("Wa", "Wb", "Wc", "Wd")
     assert rows == [(who, sea) for who in ("ik", "policy") for sea in seas]
     assert done.stdout.splitlines()[-1] == f"done: {tmp_path / 'run' / 'policy.npz'}"
+
+
+def test_nothing_is_traced_after_the_first_checkpoint(tmp_path, monkeypatch, caplog):
+    """Neither iterations nor checkpoints: what is traced time and again is kept, and grows."""
+    seen, append = [], RunDir.append
+
+    def count(self, rows):
+        if rows[0]["iteration"] == 2:
+            caplog.clear()
+        seen.append(rows[0]["iteration"])
+        append(self, rows)
+
+    monkeypatch.setattr(RunDir, "append", count)
+    with jax.log_compiles():
+        train(open_new(tmp_path / "run", CONFIG), _make_env, checkpoint_interval_s=0.0)
+    assert seen[-1] > 2
+    words = ("Finished tracing", "Compiling")
+    assert [r.getMessage() for r in caplog.records if r.getMessage().startswith(words)] == []
