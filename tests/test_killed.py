@@ -53,8 +53,8 @@ def whole(lives):
 def test_killed_twenty_times(lives, whole):
     """12 kills at operations on files (a checkpoint is 55 or more of them), 12 at random times."""
     draw = random.Random(20230207)
-    kinds = [f"event:{draw.randint(1, 200)}" for _ in range(12)]
-    kinds += [f"after:{draw.uniform(0.0, 2.0):.3f}" for _ in range(12)]
+    kinds = [f"event:{draw.randint(1, 100)}" for _ in range(12)]
+    kinds += [f"after:{draw.uniform(0.0, 0.7):.3f}" for _ in range(12)]
     draw.shuffle(kinds)
     *killed, last, end = lives("killed", 1, [*kinds, "end"])
     codes = [life["code"] for life in killed]
