@@ -33,8 +33,9 @@ def resident_mib(pid: int) -> float:
 def main() -> None:
     command = [sys.executable, "-m", "mcx_jax.train", *sys.argv[1:]]
     environment = {**os.environ, "JAX_LOG_COMPILES": "1"}
-    process = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True,
-                               stdout=subprocess.PIPE)  # fmt: skip
+    process = subprocess.Popen(
+        command, env=environment, stderr=subprocess.PIPE, text=True, stdout=subprocess.PIPE
+    )
     begun, seen = time.monotonic(), {"training": False, "compilations": 0}
 
     def read_log() -> None:
@@ -54,16 +55,22 @@ def main() -> None:
     while process.poll() is None:
         time.sleep(PERIOD_S)
         if seen["training"]:
-            rows.append({"minute": f"{(time.monotonic() - begun) / 60:.1f}",
-                         "resident_mib": f"{resident_mib(process.pid):.1f}",
-                         "compilations": seen["compilations"]})  # fmt: skip
+            rows.append(
+                {
+                    "minute": f"{(time.monotonic() - begun) / 60:.1f}",
+                    "resident_mib": f"{resident_mib(process.pid):.1f}",
+                    "compilations": seen["compilations"],
+                }
+            )
     write_rows("long_run", [{**row, **provenance()} for row in rows])
     warm = [float(r["resident_mib"]) for r in rows if 60 * float(r["minute"]) >= WARM_UP_S]
     if warm:
         growth = 100 * (max(warm[-5:]) / max(warm[:5]) - 1)
-        print(f"{rows[-1]['minute']} min; memory after {WARM_UP_S / 60:.0f} min {warm[0]:.0f} MiB, "
-              f"at the end {warm[-1]:.0f} MiB ({growth:+.2f} %); "
-              f"{rows[-1]['compilations']} compilations since the first metrics")  # fmt: skip
+        print(
+            f"{rows[-1]['minute']} min; memory after {WARM_UP_S / 60:.0f} min {warm[0]:.0f} MiB, "
+            f"at the end {warm[-1]:.0f} MiB ({growth:+.2f} %); "
+            f"{rows[-1]['compilations']} compilations since the first metrics"
+        )
 
 
 if __name__ == "__main__":

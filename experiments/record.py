@@ -9,6 +9,8 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+from tables import read
+
 FOLDER = Path(__file__).parent
 
 
@@ -38,11 +40,7 @@ def write_rows(name: str, rows: list[dict]) -> None:
 
 def kept(name: str, column: str, anew: list[str]) -> list[dict]:
     """Rows that experiments/NAME.csv has already, but for those with a `column` made anew."""
-    path = FOLDER / f"{name}.csv"
-    if not path.is_file():
-        return []
-    with path.open(newline="") as file:
-        return [row for row in csv.DictReader(file) if row[column] not in anew]
+    return [row for row in read(name) if row[column] not in anew]
 
 
 def evaluation_rows(rows: list[dict], seconds: float) -> list[dict]:

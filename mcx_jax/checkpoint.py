@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mcx_jax import hosts
-from mcx_jax.errors import UserError
+from mcx_jax.errors import UserError, reason
 
 FORMAT = 2
 KEEP = 2
@@ -63,7 +63,7 @@ def save(run_dir: Path, iteration: int, state: Any, config: str = "") -> None:
             shutil.rmtree(left)
         partial.mkdir()
         ocp = _orbax()
-        with _alone(ocp) as writer:
+        with _checkpointer(ocp) as writer:
             writer.save(partial / STATE, args=ocp.args.StandardSave(flat))
         _write_manifest(partial, iteration, config, _types(flat))
         partial.rename(folder / str(iteration))
@@ -78,7 +78,7 @@ def save(run_dir: Path, iteration: int, state: Any, config: str = "") -> None:
         kept = f"the checkpoint of iteration {last} is whole" if last else "there is none yet"
         raise UserError(
             f"{folder}: the checkpoint of iteration {iteration} cannot be written "
-            f"({_reason(error)}); {kept}: mend this, then go on with --resume"
+            f"({reason(error)}); {kept}: mend this, then go on with --resume"
         ) from None
 
 
@@ -133,10 +133,10 @@ def restore(run_dir: Path, like: Any, iteration: int | None = None) -> Any:
     # Read into the host's memory and laid out from there, which any number of processes can do.
     blank = {path: np.zeros(leaf.shape, leaf.dtype) for path, leaf in wanted.items()}
     try:
-        with _alone(ocp) as reader:
+        with _checkpointer(ocp) as reader:
             stored = reader.restore(where / STATE, args=ocp.args.StandardRestore(blank))
     except (ValueError, KeyError, OSError, TypeError) as error:
-        raise UserError(f"{where}: cannot be restored ({_reason(error)})") from None
+        raise UserError(f"{where}: cannot be restored ({reason(error)})") from None
     return _unflatten(like, {path: _laid_out(x, wanted[path]) for path, x in stored.items()})
 
 
@@ -281,11 +281,6 @@ def _sync(path: Path) -> None:
         os.close(handle)
 
 
-def _reason(error: Exception) -> str:
-    text = getattr(error, "strerror", None) or str(error).strip() or type(error).__name__
-    return text.splitlines()[0][:300]
-
-
 def _orbax() -> Any:
     """orbax.checkpoint, loaded late (it takes seconds) and quiet about its own workings."""
     import orbax.checkpoint as ocp
@@ -299,7 +294,7 @@ def _orbax() -> Any:
     return ocp
 
 
-def _alone(ocp: Any) -> Any:
+def _checkpointer(ocp: Any) -> Any:
     """A writer and reader that waits for no other process."""
     me = jax.process_index()
     options = ocp.options.MultiprocessingOptions(primary_host=me, active_processes={me})

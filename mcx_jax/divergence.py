@@ -112,4 +112,4 @@ def states(config: TrainConfig, before: Any, after: Any) -> dict[str, np.ndarray
         if state is not None:
             flat[f"{name}.action"] = act(state)
             flat |= {name + path: leaf for path, leaf in checkpoint.flatten(state).items()}
-    return {name: np.asarray(leaf) for name, leaf in hosts.whole(flat).items()}
+    return hosts.whole(flat)

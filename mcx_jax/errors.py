@@ -25,3 +25,9 @@ def require(ok: bool, message: str) -> None:
     """Raise a UserError with `message` unless `ok`."""
     if not ok:
         raise UserError(message)
+
+
+def reason(error: BaseException) -> str:
+    """The first line of what an error says of itself, at most 300 characters; never empty."""
+    text = getattr(error, "strerror", None) or str(error).strip() or type(error).__name__
+    return text.splitlines()[0][:300]

@@ -16,13 +16,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from mcx_jax.errors import UserError
+from mcx_jax.errors import UserError, reason
 
 PLACE = re.compile(r"(?P<coordinator>[^,\s]+:\d+),(?P<index>\d+)/(?P<count>\d+)")
 BROKEN = re.compile("Gloo|NCCL|UNAVAILABLE|[Cc]onnection|heartbeat")
 """What JAX's errors say when another process has gone (on a CPU they are ValueErrors)."""
-LINE = 400
-"""Characters of an error that are shown."""
 WAIT_S = 120
 """For the other processes to begin."""
 
@@ -38,8 +36,8 @@ def check(text: str) -> None:
 
 
 def join(text: str) -> None:
-    """Meet the other processes; call before anything is computed. Those after the first fall silent
-    on stdout. Does nothing for "".
+    """Meet the other processes; call before JAX looks for its devices. Those after the first fall
+    silent on stdout. Does nothing for "".
 
     Args:
         text: value of --distributed.
@@ -59,8 +57,8 @@ def join(text: str) -> None:
         else:
             jax.distributed.initialize()
     except (OSError, RuntimeError, ValueError) as error:
-        reason = str(error).strip().splitlines()[0][:200]
-        raise UserError(f"--distributed {text}: the processes did not meet ({reason})") from None
+        said = reason(error)
+        raise UserError(f"--distributed {text}: the processes did not meet ({said})") from None
     if not first():
         contextlib.redirect_stdout(open(os.devnull, "w")).__enter__()  # for good
 
@@ -129,12 +127,11 @@ def agree(*numbers: int) -> tuple[int, ...]:
 def whole(arrays: dict[str, Any]) -> dict[str, Any]:
     """The arrays with the parts of all processes, as NumPy's; all processes have to call this."""
     import jax
-    import numpy as np
     from jax.experimental import multihost_utils
 
     def gather(x: Any) -> Any:
         if alone() or x.is_fully_replicated:
-            return np.asarray(jax.device_get(x))
+            return jax.device_get(x)
         return multihost_utils.process_allgather(x, tiled=True)
 
     return {name: gather(x) for name, x in arrays.items()}
@@ -151,14 +148,16 @@ def together(path: Path) -> Iterator[None]:
     except Exception as error:
         if alone():
             raise
-        code, said = 2, str(error).strip().splitlines()[0]
-        if BROKEN.search(said):
-            me = f"process {jax.process_index()} of {jax.process_count()}"
-            said = f"{path}: {me} has lost another one; start all again with --resume ({said})"
-        elif not isinstance(error, UserError):
-            traceback.print_exc()
-            code = 1
-        print(f"error: {said[:LINE]}", file=sys.stderr, flush=True)
+        code, said = 2, str(error)
+        if not isinstance(error, UserError):
+            said = reason(error)
+            if BROKEN.search(said):
+                me = f"process {jax.process_index()} of {jax.process_count()}"
+                said = f"{path}: {me} has lost another one; start all again with --resume ({said})"
+            else:
+                traceback.print_exc()
+                code = 1
+        print(f"error: {said}", file=sys.stderr, flush=True)
         # Not by SystemExit: on the way out JAX would wait for the others, and then abort.
         os._exit(code)
 

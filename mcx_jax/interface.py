@@ -3,7 +3,6 @@
 Every exported form carries or follows this one description (`python -m mcx_jax.export`).
 """
 
-import functools
 import json
 from typing import Any
 
@@ -58,10 +57,10 @@ def describe(net: PolicyNet, obs_size: int, config: str) -> dict[str, Any]:
     }
 
 
-@functools.cache  # every checkpoint of a run asks, and a lambda is traced anew each time
 def state_sizes(net: PolicyNet) -> dict[str, int]:
     """Length of each array of the memory by its name, in the order of the carry's leaves."""
-    leaves, _ = jax.tree.flatten_with_path(jax.eval_shape(lambda: init_carry(net, ())))
+    # Not eval_shape of a lambda: every checkpoint of a run asks, and JAX would trace and keep each.
+    leaves, _ = jax.tree.flatten_with_path(init_carry(net, ()))
     return {_leaf_name(path): leaf.shape[-1] for path, leaf in leaves}
 
 

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
+from mcx_jax import hosts
 from mcx_jax.errors import UserError
 
 FUSION_FLAG = "--xla_cpu_use_fusion_emitters"
@@ -53,19 +54,22 @@ def cache_dir() -> Path:
     return Path(os.environ.get("MCX_JAX_CACHE", str(default)))
 
 
-def configure(device: str = "auto", *, mjx: bool = False, cores: int | None = None) -> list[str]:
+def configure(
+    device: str = "auto", *, mjx: bool = False, cores: int | None = None, distributed: str = ""
+) -> list[str]:
     """Set XLA flags, the compilation cache and matmul precision; call before any JAX computation.
 
     Args:
         device: "auto", "cpu" or "gpu".
         mjx: MJX will run in this process.
         cores: devices that the CPU shall count as; None = all cores that this process may use.
+        distributed: the other processes of this run (`mcx_jax.hosts.join`).
 
     Returns:
         One line for each thing that was set, for the user to read.
 
     Raises:
-        UserError: a GPU was asked for and JAX finds none.
+        UserError: a GPU was asked for and JAX finds none; the other processes do not come.
     """
     said = []
     cores = len(os.sched_getaffinity(0)) if cores is None else cores
@@ -83,6 +87,7 @@ def configure(device: str = "auto", *, mjx: bool = False, cores: int | None = No
     if os.environ.get("MCX_JAX_CACHE") != "":
         jax.config.update("jax_compilation_cache_dir", str(cache_dir()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    hosts.join(distributed)  # which JAX allows only before it has looked for devices
     if device == "gpu":
         _require_gpu(jax)
     return said

@@ -158,9 +158,9 @@ def main(argv: list[str] | None = None) -> None:
         tensorboard.require()
     if command.smoke:
         print(compile_quickly())
-    said = startup.configure(command.device, mjx=run.config.env.physics == "mjx")
-    hosts.join(command.distributed)
-    print(*said, sep="\n")
+    mjx = run.config.env.physics == "mjx"
+    for line in startup.configure(command.device, mjx=mjx, distributed=command.distributed):
+        print(line)
     print(machine.describe())
     print(run.config.env.describe_delays())
     print(f"run directory: {run.path}", flush=True)

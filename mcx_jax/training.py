@@ -155,7 +155,7 @@ def train(
         SystemExit: stopped by a signal, after saving.
     """
     run = replace(run, writes=hosts.first())
-    with run.held(), hosts.together(run.path):
+    with hosts.together(run.path), run.held():
         return _train(run, make_env, events and run.writes, checkpoint_interval_s)
 
 

@@ -6,6 +6,7 @@ import sys
 
 import pytest
 
+from mcx_jax import startup
 from mcx_jax.errors import UserError
 from mcx_jax.startup import (
     DEVICES_FLAG,
@@ -60,3 +61,13 @@ def test_import_sets_no_flag():
     )
     clean = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
     subprocess.run([sys.executable, "-c", code], check=True, env=clean)
+
+
+def test_processes_meet_before_jax_looks_for_devices(monkeypatch):
+    """Else `train --device gpu --distributed auto` would be too late for JAX."""
+    order = []
+    monkeypatch.setattr(startup.hosts, "join", lambda text: order.append(text))
+    monkeypatch.setattr(startup, "_require_gpu", lambda jax: order.append("devices"))
+    monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))
+    startup.configure("gpu", cores=1, distributed="auto")
+    assert order == ["auto", "devices"]
