@@ -2,10 +2,10 @@
 
     python experiments/sweep.py ppo|first-order [--seeds N] [--quiet] [DELAY...] [-- TRAIN OPTIONS]
 
-Runs are kept in runs/ under the names that `train` gives them (-quiet: the integrator implicitfast)
-and gone on with if they are not finished; one run a seed, as tools/sweep.sbatch makes them, does as
-well. Writes experiments/ppo.csv or first_order.csv (--quiet:
-..._quiet.csv): rows of `ik` and of every seed, for the delays named and those that the file has.
+Runs are kept in runs/ under the names that `train` gives them and gone on with if they are not
+finished; one run a seed, as tools/sweep.sbatch makes them, does as well. --quiet: with the
+integrator implicitfast, "-quiet" in the names. Writes experiments/ppo.csv or first_order.csv
+(..._quiet.csv): rows of `ik` and of every seed, for the delays named and those that the file has.
 """
 
 import subprocess
@@ -19,31 +19,34 @@ from mcx_jax.checkpoint import latest
 from mcx_jax.run_dir import CONFIG, stored_config
 
 DELAYS = ("E0", "B4_21", "E1", "B4_4", "E2")
+RUNS = Path("runs")
 
 
 def trained(algo: str, delay: str, seeds: int, quiet: bool, options: list[str]) -> list[Path]:
-    """The runs of a delay, trained to their end."""
-    kind, tail = "fast" if algo == "ppo" else algo, "-quiet" if quiet else ""
-    single = [Path("runs") / f"{delay}-{kind}-s{seed}{tail}" for seed in range(seeds)]
-    if seeds == 1 or all((run / CONFIG).exists() for run in single):
-        return [finished(run, algo, delay, 1, quiet, options) for run in single]
-    together = Path("runs") / f"{delay}-{kind}-s0-{seeds - 1}{tail}"
-    return [finished(together, algo, delay, seeds, quiet, options)]
-
-
-def finished(run: Path, algo: str, delay: str, seeds: int, quiet: bool, options: list[str]) -> Path:
-    """A run, begun or gone on with if it has to be."""
-    command = [sys.executable, "-m", "mcx_jax.train", "--run-dir", str(run)]
-    begun = (run / CONFIG).exists()
-    if begun:
-        command += ["--resume"]
-    else:
-        command += ["--algo", algo, "--delay", delay, "--seeds", str(seeds), *options]
-        command += ["--integrator", "implicitfast"] * quiet
-    if not begun or latest(run) != stored_config(run).iterations:
-        print(" ".join(command), flush=True)
-        subprocess.run(command, check=True)
-    return run
+    """Runs that hold the seeds 0 to seeds - 1 of a delay, trained to their end; from the first seed
+    that is in no run on, all in one call."""
+    stem = f"{delay}-{'fast' if algo == 'ppo' else algo}" + "-quiet" * quiet
+    runs: list[Path] = []
+    first = 0
+    while first < seeds:
+        named = (RUNS / f"{stem}-s{first}", *sorted(RUNS.glob(f"{stem}-s{first}-*")))
+        begun = [run for run in named if (run / CONFIG).exists()]
+        command = [sys.executable, "-m", "mcx_jax.train"]
+        if begun:
+            run = begun[-1]
+            command += ["--run-dir", str(run), "--resume"]
+        else:
+            last = f"-{seeds - 1}" if seeds - 1 > first else ""
+            run = RUNS / f"{stem}-s{first}{last}"
+            command += ["--run-dir", str(run), "--algo", algo, "--delay", delay]
+            command += ["--seed", str(first), "--seeds", str(seeds - first), *options]
+            command += ["--integrator", "implicitfast"] * quiet
+        if not begun or latest(run) != stored_config(run).iterations:
+            print(" ".join(command), flush=True)
+            subprocess.run(command, check=True)
+        runs.append(run)
+        first += stored_config(run).seeds
+    return runs
 
 
 def main() -> None:
