@@ -32,6 +32,7 @@ CHEAP = (
     "test_config",
     "test_cli",
     "test_spatial",
+    "test_batch_last",
     "test_results",
     "test_policy",
     "test_observe",

@@ -404,25 +404,20 @@ def in_float64(tree):
 
 
 def test_whole_batches_are_the_same_task(env):
-    """The faster way of tracing under vmap: values, and the derivative from outside."""
+    """The faster way of tracing under vmap; its derivative: tests/test_batch_last.py."""
     keys = jax.random.split(jax.random.key(8), 3)
 
     @jax.jit
     def run(env, keys, action):
-        def loss(action):
-            state = jax.vmap(env.reset, out_axes=-1)(keys)
-            step = jax.vmap(env.step, in_axes=(-1, -1), out_axes=-1)
-            state = step(step(step(state, action), action), action)
-            return jnp.sum(state.reward), state
-
-        return jax.value_and_grad(loss, has_aux=True)(action)
+        state = jax.vmap(env.reset, out_axes=-1)(keys)
+        step = jax.vmap(env.step, in_axes=(-1, -1), out_axes=-1)
+        return jax.lax.scan(lambda s, _: (step(s, action), None), state, length=3)[0]
 
     action = 0.01 * jax.random.normal(jax.random.key(1), (6, 3))
     plain, whole = (run(env.replace(whole_batches=w), keys, action) for w in (False, True))
-    # The same operations in another program: rounding of poses of 1 m; gradients of 1e-2 a cm.
+    # The same operations in another program: rounding of poses of 1 m.
     for a, b in zip(jax.tree.leaves(plain), jax.tree.leaves(whole), strict=True):
         np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-6)
-    assert np.abs(plain[1]).max() > 1e-4
 
 
 def test_gradient_of_the_reward_by_the_action(env, first):
