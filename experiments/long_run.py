@@ -14,9 +14,9 @@ import time
 from pathlib import Path
 
 from record import provenance, write_rows
+from tables import growth
 
 PERIOD_S = 30.0
-WARM_UP_S = 300.0
 WORK = ("Finished tracing", "Compiling ")
 
 
@@ -40,7 +40,10 @@ def main() -> None:
 
     def read_log() -> None:
         for line in process.stderr:
-            seen["compilations"] += seen["training"] and any(word in line for word in WORK)
+            if any(word in line for word in WORK):
+                seen["compilations"] += seen["training"]
+            elif line.startswith("error: "):
+                print(line, end="", file=sys.stderr)
 
     def read_said() -> None:
         for line in process.stdout:
@@ -62,15 +65,10 @@ def main() -> None:
                     "compilations": seen["compilations"],
                 }
             )
+    if not rows:
+        raise SystemExit(process.returncode or "shorter than one sample")
     write_rows("long_run", [{**row, **provenance()} for row in rows])
-    warm = [float(r["resident_mib"]) for r in rows if 60 * float(r["minute"]) >= WARM_UP_S]
-    if warm:
-        growth = 100 * (max(warm[-5:]) / max(warm[:5]) - 1)
-        print(
-            f"{rows[-1]['minute']} min; memory after {WARM_UP_S / 60:.0f} min {warm[0]:.0f} MiB, "
-            f"at the end {warm[-1]:.0f} MiB ({growth:+.2f} %); "
-            f"{rows[-1]['compilations']} compilations since the first metrics"
-        )
+    print(growth(rows))
 
 
 if __name__ == "__main__":

@@ -55,7 +55,9 @@ def main() -> None:
         words, options = words[: words.index("--")], words[words.index("--") + 1 :]
     algo, quiet = words[0], "--quiet" in words
     seeds = int(words[words.index("--seeds") + 1]) if "--seeds" in words else 1
-    delays = [word for word in words if word in DELAYS] or list(DELAYS)
+    delays = [word for word in words[1:] if word in DELAYS] or list(DELAYS)
+    if unknown := set(words[1:]) - {*DELAYS, "--quiet", "--seeds", str(seeds)}:
+        raise SystemExit(f"unknown: {', '.join(unknown)}; delays are {', '.join(DELAYS)}")
     runs = [trained(algo, delay, seeds, quiet, options) for delay in delays]
     startup.configure()
     name = algo.replace("-", "_") + ("_quiet" if quiet else "")

@@ -12,9 +12,18 @@ from pathlib import Path
 
 FOLDER = Path(__file__).parent
 ROOT = FOLDER.parent
-PAGES = ("README.md", "docs/results.md", "docs/paper.md", "docs/task.md", "docs/cluster.md")
+PAGES = (
+    "README.md",
+    "docs/results.md",
+    "docs/paper.md",
+    "docs/task.md",
+    "docs/cluster.md",
+    "docs/trust.md",
+)
 SEAS = ("Wa", "Wb", "Wc", "Wd")
 DELAYS = ("E0", "B4_21", "E1", "B4_4", "E2")
+WARM_UP_S = 300.0
+"""Of a long run, before its memory counts."""
 
 
 def read(name: str) -> list[dict[str, str]]:
@@ -163,6 +172,7 @@ def agents() -> str:
         sources = {source(r): None for r in cells.values()}
         table = markdown([*header, "trained", "seeds"], rows)
         blocks.append(table + "\n\nSource: " + "; ".join(sources))
+        blocks += _over_seeds_line(name)
         worst = [_below_paper(cell) for cell in cells.values()]
         if all(worst):
             below = [line for lines in worst for line in lines[1:]]
@@ -170,6 +180,81 @@ def agents() -> str:
             found += ": " + ", ".join(below) if below else ""
             blocks.append(f"Improvements of top 5 %, top 1 % and maximum over `ik`: {found}.")
     return "\n\n".join(blocks) or "not measured yet (`python experiments/sweep.py ppo`)"
+
+
+def _over_seeds_line(name: str) -> list[str]:
+    """How far seeds differ, if a delay has several."""
+    import numpy as np
+
+    from mcx_jax.results import bootstrap_interval, interquartile_mean
+
+    groups: dict[tuple[str, str], list[dict[str, str]]] = {}
+    for row in read(name):
+        if row["who"] != "ik":
+            groups.setdefault((row["delay"], row["sea"]), []).append(row)
+    most = max((len(rows) for rows in groups.values()), default=0)
+    if most < 2:
+        return []
+    said = []
+    for unit, what in (("pos_mm", "position"), ("ang_mrad", "orientation")):
+        reach, single = 0.0, 0.0
+        for rows in groups.values():
+            values = np.array([float(r[unit]) for r in rows])
+            single = max(single, values.max() / float(rows[0][f"{unit}_paper"]))
+            if len(rows) > 1:
+                middle = interquartile_mean(values)
+                ends = np.array(bootstrap_interval(values, draws=1000))
+                reach = max(reach, np.abs(ends / middle - 1).max())
+        said.append(f"{what} {100 * reach:.0f} % and {single:.2f}")
+    return [
+        "Seeds: interquartile means above; the widest 95 % bootstrap interval of a cell reaches so "
+        "far from it, and the worst cell of any single seed is so much of the paper's: "
+        f"{', '.join(said)}."
+    ]
+
+
+def goals() -> str:
+    """Goals that move on the deck."""
+    stored = read("goals")
+    if not stored:
+        return "not measured yet (`python experiments/goals.py`)"
+    cells = {(r["who"], r["goal"]): r for r in stored}
+    paths = list(dict.fromkeys(r["goal"] for r in stored))
+    rows = [
+        [who, *(_mean_and_max(cells[who, path]) for path in paths)]
+        for who in dict.fromkeys(r["who"] for r in stored)
+    ]
+    table = markdown(["mean (largest), mm, mrad", *paths], rows)
+    return table + "\n\nSource: " + source(stored[0])
+
+
+def _mean_and_max(r: dict[str, str]) -> str:
+    return ", ".join(
+        f"{float(r[unit + '_mean']):.2f} ({float(r[unit + '_max']):.1f})"
+        for unit in ("pos_mm", "ang_mrad")
+    )
+
+
+def growth(rows: list[dict]) -> str:
+    """How resident memory grew after the warm-up (the largest of the first and of the last five
+    samples, which see a checkpoint or not), and what was compiled."""
+    warm = [float(r["resident_mib"]) for r in rows if 60 * float(r["minute"]) >= WARM_UP_S]
+    if not warm:
+        return f"shorter than the warm-up of {WARM_UP_S / 60:.0f} min"
+    percent = 100 * (max(warm[-5:]) / max(warm[:5]) - 1)
+    return (
+        f"{rows[-1]['minute']} min; memory after {WARM_UP_S / 60:.0f} min {warm[0]:.0f} MiB, "
+        f"at the end {warm[-1]:.0f} MiB ({percent:+.2f} %); "
+        f"{rows[-1]['compilations']} traces and compilations since the first metrics"
+    )
+
+
+def long_run() -> str:
+    """Memory and compilations of a run of half an hour."""
+    stored = read("long_run")
+    if not stored:
+        return "not measured yet (`python experiments/long_run.py`)"
+    return growth(stored) + ". Source: " + source(stored[0])
 
 
 def robust() -> str:

@@ -38,7 +38,7 @@ from mcx_jax.progress import Progress  # noqa: E402
 from mcx_jax.run_dir import CONFIG, open_existing, open_new  # noqa: E402
 from mcx_jax.training import train  # noqa: E402
 
-ITERATIONS = 40
+ITERATIONS = 100
 RUN_CONFIG = replace(
     preset_config("fast"),
     num_envs=8,

@@ -17,7 +17,7 @@ from mcx_jax import hosts
 from mcx_jax.errors import UserError
 from mcx_jax.sharding import env_mesh
 
-ITERATIONS = 40
+ITERATIONS = 100
 LIMIT_S = 300
 
 
