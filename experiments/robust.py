@@ -27,11 +27,10 @@ from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
 from mcx_jax.envs.conditions import Conditions, Noise
 from mcx_jax.envs.plant import Plant
 from mcx_jax.envs.v2v import make_env
-from mcx_jax.episodes import run_episodes
+from mcx_jax.episodes import run_everywhere
 from mcx_jax.fitted import fitted
 from mcx_jax.results import WARM_UP_STEPS
-from mcx_jax.roster import load_controller
-from mcx_jax.sharding import env_mesh, put
+from mcx_jax.roster import FITTED, load_controller
 
 DELAYS = ("B4_4", "E1", "E2", "butter:4:8Hz")
 EPISODES, SEED = 24, 0
@@ -96,11 +95,8 @@ def measure(env, controller, gain: float, rows: list[Row]) -> list[dict]:
     sea = jnp.tile(jnp.repeat(jnp.arange(seas), EPISODES), len(rows))
     every = [row for row in rows for _ in range(episodes)]
     given = conditions_of(every, jax.random.split(jax.random.key(SEED + 1), len(every)))
-    mesh = env_mesh(len(every))
-    env, controller = put(mesh, (env, controller))
-    arrays = put(mesh, (keys, sea, jnp.full(len(every), gain)), 0)
-    with jax.set_mesh(mesh):
-        dp, da, valid, *_ = jax.device_get(run(env, controller, *arrays, put(mesh, given, -1)))
+    gains = jnp.full(len(every), gain)
+    dp, da, valid, *_ = run_everywhere(env, controller, keys, sea, gains, given)
     shape = (-1, len(rows), episodes)
     dp, da = dp[WARM_UP_STEPS:].reshape(shape), da[WARM_UP_STEPS:].reshape(shape)
     return [
@@ -113,10 +109,6 @@ def measure(env, controller, gain: float, rows: list[Row]) -> list[dict]:
         }
         for i, row in enumerate(rows)
     ]
-
-
-run = jax.jit(run_episodes)
-FITTED = ("extrapolate-best", "fir")
 
 
 def controller_of(who: str):

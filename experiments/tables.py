@@ -22,8 +22,6 @@ PAGES = (
 )
 SEAS = ("Wa", "Wb", "Wc", "Wd")
 DELAYS = ("E0", "B4_21", "E1", "B4_4", "E2")
-WARM_UP_S = 300.0
-"""Of a long run, before its memory counts."""
 
 
 def read(name: str) -> list[dict[str, str]]:
@@ -236,16 +234,24 @@ def _mean_and_max(r: dict[str, str]) -> str:
 
 
 def growth(rows: list[dict]) -> str:
-    """How resident memory grew after the warm-up (the largest of the first and of the last five
-    samples, which see a checkpoint or not), and what was compiled."""
-    warm = [float(r["resident_mib"]) for r in rows if 60 * float(r["minute"]) >= WARM_UP_S]
-    if not warm:
-        return f"shorter than the warm-up of {WARM_UP_S / 60:.0f} min"
-    percent = 100 * (max(warm[-5:]) / max(warm[:5]) - 1)
+    """Resident memory of a long run over time, and what was traced or compiled (the larger of two
+    samples around an instant: a checkpoint is being written in some)."""
+    minutes = [float(r["minute"]) for r in rows]
+    mib = [float(r["resident_mib"]) for r in rows]
+
+    def around(minute: float) -> float:
+        near = sorted(range(len(rows)), key=lambda i: abs(minutes[i] - minute))[:3]
+        return max(mib[i] for i in near)
+
+    end, half = minutes[-1], minutes[-1] / 2
+    marks = [m for m in (5, 10, 20, 30, 40) if m < end]
+    seen = ", ".join(f"{around(m):.0f} (minute {m})" for m in marks)
+    counts = [int(r["compilations"]) for r in rows]
+    last = counts.index(counts[-1])
     return (
-        f"{rows[-1]['minute']} min; memory after {WARM_UP_S / 60:.0f} min {warm[0]:.0f} MiB, "
-        f"at the end {warm[-1]:.0f} MiB ({percent:+.2f} %); "
-        f"{rows[-1]['compilations']} traces and compilations since the first metrics"
+        f"{end:.1f} min, resident MiB: {seen}, {around(end):.0f} at the end; in the second half "
+        f"{100 * (around(end) / around(half) - 1):+.2f} %. Traces and compilations after the first "
+        f"metrics: {counts[-1]}, the last of them before minute {minutes[last]:.1f}"
     )
 
 
@@ -283,8 +289,14 @@ def _lead(cells: dict[tuple[str, str], dict[str, str]], rivals: tuple[str, ...])
     names = dict.fromkeys(what for what, _ in cells)
 
     def behind(what: str) -> bool:
+        """One that diverged (nan) is behind everybody."""
+
+        def error(who: str, unit: str) -> float:
+            value = float(cells[what, who][unit])
+            return value if math.isfinite(value) else math.inf
+
         return any(
-            float(cells[what, "robust"][unit]) >= min(float(cells[what, r][unit]) for r in rivals)
+            error("robust", unit) >= min(error(r, unit) for r in rivals)
             for unit in ("pos_mm", "ang_mrad")
         )
 
@@ -403,6 +415,7 @@ TABLES = {
     "controllers": controllers,
     "agents": agents,
     "robust": robust,
+    "long_run": long_run,
     "speed": speed,
     "scaling": scaling,
     "observation": observation,

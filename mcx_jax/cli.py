@@ -16,7 +16,7 @@ from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import tyro
 
-from mcx_jax.errors import UserError
+from mcx_jax.errors import UserError, reason
 
 Config = TypeVar("Config")
 
@@ -143,8 +143,7 @@ def check_name(flag: str, path: str | Path) -> None:
     except (FileNotFoundError, NotADirectoryError):
         pass
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise UserError(f"{flag} {path}: cannot be used ({reason}); name another") from None
+        raise UserError(f"{flag} {path}: cannot be used ({reason(error)}); name another") from None
 
 
 def write_output(flag: str, path: str, text: str) -> None:
@@ -153,7 +152,7 @@ def write_output(flag: str, path: str, text: str) -> None:
         Path(path).write_text(text, encoding="utf-8")
     except OSError as error:
         raise UserError(
-            f"{flag} {path}: cannot be written ({error.strerror}); choose a writable file"
+            f"{flag} {path}: cannot be written ({reason(error)}); choose a writable file"
         ) from None
 
 
@@ -190,13 +189,22 @@ def _build(config_type: type[Config], values: Any, where: str) -> Config:
     if unknown or missing:
         problem = f"unknown setting {unknown[0]!r}" if unknown else f"no setting {missing[0]!r}"
         raise UserError(f"{where}: {problem}; it was written by another version of mcx_jax")
-    checked = {name: _value(hints[name], values[name], f"{where}: {name}") for name in names}
+    checked = {name: checked_value(hints[name], values[name], f"{where}: {name}") for name in names}
     return config_type(**checked)
 
 
-def _value(hint: Any, value: Any, where: str) -> Any:
-    """`value` as the type `hint`: a dataclass, a Literal, bool, int, float or str."""
+def checked_value(hint: Any, value: Any, where: str) -> Any:
+    """`value` as the type `hint`: a dataclass (or its fields), a Literal, bool, int, float or str.
+
+    Args:
+        where: begins the message, e.g. "config.json: seed".
+
+    Raises:
+        UserError: it is not.
+    """
     if dataclasses.is_dataclass(hint):
+        if type(value) is hint:
+            return value
         return _build(hint, value, where)  # type: ignore[arg-type]
     if get_origin(hint) is Literal:
         if value not in get_args(hint):

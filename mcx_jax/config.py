@@ -172,7 +172,7 @@ class TrainConfig:
         check_seed(self.seed, self.seeds)
         sequences = self.num_envs * (self.ppo.window_steps // self.ppo.sequence_steps)
         require(
-            sequences % self.ppo.minibatches == 0,
+            self.algo != "ppo" or sequences % self.ppo.minibatches == 0,
             f"--num-envs {self.num_envs} gives {sequences} sequences a window, which --minibatches "
             f"{self.ppo.minibatches} does not divide; use a multiple of {self.ppo.minibatches}",
         )

@@ -15,10 +15,11 @@ import numpy as np
 
 from mcx_jax import checkpoint, hosts
 from mcx_jax.config import TrainConfig
-from mcx_jax.errors import UserError
+from mcx_jax.errors import UserError, reason
 from mcx_jax.ppo.networks import step
 from mcx_jax.ppo.normalise import normalise_obs
 from mcx_jax.ppo.trainer import networks_of
+from mcx_jax.progress import LEFT_OUT
 from mcx_jax.run_dir import RunDir
 
 LIMIT = 10
@@ -59,9 +60,9 @@ class Watch:
                 state,
                 rows,
                 f"nothing was learned in {LIMIT} iterations in a row (in the last one "
-                f"{100 * row['rejected_share']:.0f} % of the windows were left out, "
-                f"{row['skipped_updates']:.0f} updates skipped, {row['reset_envs']:.0f} "
-                "environments reset)",
+                f"{100 * row['rejected_share']:.0f} % of the {LEFT_OUT[self.run.config.algo]} were "
+                f"left out, {row['skipped_updates']:.0f} updates skipped, "
+                f"{row['reset_envs']:.0f} environments reset)",
             )
 
     def check(self, state: Any, rows: list[dict[str, Any]]) -> None:
@@ -78,7 +79,7 @@ class Watch:
     def _count(self, rows: list[dict[str, Any]]) -> None:
         self.lost = self.lost + 1 if any(row["lost"] for row in rows) else 0
 
-    def _stop(self, state: Any, rows: list[dict[str, Any]], reason: str) -> None:
+    def _stop(self, state: Any, rows: list[dict[str, Any]], why: str) -> None:
         where, last = self.run.path, checkpoint.latest(self.run.path)
         good = f"the checkpoint of iteration {last} is kept" if last else "there is no checkpoint"
         path = where / f"diverged-{rows[0]['iteration']}.npz"
@@ -88,9 +89,9 @@ class Watch:
                 np.savez(path, allow_pickle=False, rows=json.dumps(rows), **arrays)
             dump = f"the states are in {path}"
         except OSError as error:
-            dump = f"the states could not be written ({error.strerror})"
+            dump = f"the states could not be written ({reason(error)})"
         raise UserError(
-            f"{where}: stopped at iteration {rows[0]['iteration']}: {reason}; {good}, {dump}; "
+            f"{where}: stopped at iteration {rows[0]['iteration']}: {why}; {good}, {dump}; "
             "start another run with a smaller step size or another --seed"
         )
 

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from mcx_jax import cli
-from mcx_jax.errors import UserError
+from mcx_jax.errors import UserError, reason
 
 if TYPE_CHECKING:
     from mcx_jax.policy import Policy
@@ -75,7 +75,7 @@ def export(policy: "Policy", path: Path) -> None:
     try:
         write_whole(path, content)
     except OSError as error:
-        raise UserError(f"--out {path}: cannot be written: {error.strerror}") from None
+        raise UserError(f"--out {path}: cannot be written: {reason(error)}") from None
 
 
 def stablehlo_bytes(policy: "Policy") -> bytes:

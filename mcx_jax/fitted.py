@@ -17,9 +17,11 @@ from flax import struct
 from mcx_jax.controllers import HOLD_LEAD_S, Extrapolate, correction
 from mcx_jax.delay import PHYSICS_DT_S, SUBSTEPS
 from mcx_jax.envs import conditions
+from mcx_jax.envs.motion import LOOK_AHEAD_STEPS
 from mcx_jax.envs.state import EnvState
 from mcx_jax.envs.v2v import V2VEnv
 from mcx_jax.episodes import episode_errors
+from mcx_jax.errors import UserError
 from mcx_jax.results import WARM_UP_STEPS
 from mcx_jax.spatial import (
     exp_rotation,
@@ -118,8 +120,10 @@ def _regression(
             shift = jnp.stack(p) - measured.position
             return measured, (_flat(measured), jnp.concatenate([shift, jnp.stack(turn)]))
 
-        _, (poses, wanted) = jax.lax.scan(body, first, jnp.arange(1, FIT_STEPS + 1))
-        rows = jnp.arange(FIT_STEPS - TAPS + 1)[:, None] + jnp.arange(TAPS)
+        # Motion ends 2 s after the episode: half of them are left for the lead.
+        steps = min(FIT_STEPS, env.episode_steps + LOOK_AHEAD_STEPS // 2)
+        _, (poses, wanted) = jax.lax.scan(body, first, jnp.arange(1, steps + 1))
+        rows = jnp.arange(steps - TAPS + 1)[:, None] + jnp.arange(TAPS)
         return jax.vmap(features)(poses[rows]), wanted[TAPS - 1 :]
 
     return jax.lax.map(episode, keys)
@@ -130,6 +134,9 @@ def fitted(who: str, env: V2VEnv) -> Any:
 
     Args:
         env: on training motion.
+
+    Raises:
+        UserError: none of them keeps the arm's state finite.
     """
     known_s = env.known_delay.group_delay_s
     leads_s = [known_s + lead for lead in LEADS_S]
@@ -137,11 +144,14 @@ def fitted(who: str, env: V2VEnv) -> Any:
         candidates: list[Any] = [Extrapolate(jnp.float32(lead)) for lead in leads_s]
     else:
         candidates = [fit_fir(env, lead) for lead in leads_s]
-    scores = [_score(env, candidate) for candidate in candidates]
-    return candidates[int(np.argmin(scores))]
+    scores = np.array([_score(env, candidate) for candidate in candidates])
+    if not np.isfinite(scores).any():
+        raise UserError(f"{who}: the arm diverges on training motion, whatever the lead")
+    return candidates[int(np.argmin(np.nan_to_num(scores, nan=np.inf)))]
 
 
 def _score(env: V2VEnv, controller: Any) -> float:
-    """Mean of dp and da (m + rad) over training episodes, the reward's own measure."""
+    """Mean of dp and da (m + rad) over training episodes, the reward's own measure; NaN if one
+    of them diverges."""
     dp, da, *_ = episode_errors(env, controller, (1.0,), 8, FIT_SEED)
     return float(np.mean(dp[WARM_UP_STEPS:]) + np.mean(da[WARM_UP_STEPS:]))

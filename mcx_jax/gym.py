@@ -22,7 +22,7 @@ Episode n of seed s begins with the key `fold_in(key(s), n)`, alone and among ma
 import dataclasses
 from collections.abc import Sequence
 from functools import cache, partial
-from typing import Any, Literal
+from typing import Any, Literal, get_type_hints
 
 import gymnasium
 import jax
@@ -32,6 +32,7 @@ from flax import struct
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from mcx_jax.cli import checked_value
 from mcx_jax.delay import CONTROL_DT_S
 from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.envs.state import EnvState
@@ -47,7 +48,7 @@ class Told:
     """What a learner is told of N environments."""
 
     obs: Any
-    """(N, 38)."""
+    """(N, 38); (N, 39) with the measurement's age, where `conditions` has `latency_steps`."""
     reward: Any
     """(N,)."""
     truncated: Any
@@ -141,8 +142,10 @@ def _task(env: EnvConfig, motion: MotionConfig, split: Literal["train", "test"])
 def _make_task(test: bool, settings: dict[str, Any]) -> V2VEnv:
     configs = []
     for config in (EnvConfig, MotionConfig):
-        names = [field.name for field in dataclasses.fields(config)]
-        configs.append(config(**{k: settings.pop(k) for k in names if k in settings}))
+        hints = get_type_hints(config)
+        given = {k: settings.pop(k) for k in hints if k in settings}
+        checked = {k: checked_value(hints[k], x, f"setting {k}") for k, x in given.items()}
+        configs.append(config(**checked))
     if settings:
         raise UserError(
             f"unknown setting {next(iter(settings))!r}: use test or a field of EnvConfig or "

@@ -18,7 +18,7 @@ from typing import Any
 
 from mcx_jax.errors import UserError, reason
 
-PLACE = re.compile(r"(?P<coordinator>[^,\s]+:\d+),(?P<index>\d+)/(?P<count>\d+)")
+PLACE = re.compile(r"(?P<coordinator>[^,\s]+:(?P<port>\d+)),(?P<index>\d+)/(?P<count>\d+)")
 BROKEN = re.compile("Gloo|NCCL|UNAVAILABLE|[Cc]onnection|heartbeat")
 """What JAX's errors say when another process has gone (on a CPU they are ValueErrors)."""
 WAIT_S = 120
@@ -28,7 +28,8 @@ WAIT_S = 120
 def check(text: str) -> None:
     """Refuse a value of --distributed that cannot be meant."""
     place = PLACE.fullmatch(text)
-    if text not in ("", "auto") and not (place and int(place["index"]) < int(place["count"])):
+    meant = place and int(place["index"]) < int(place["count"]) and 0 < int(place["port"]) < 65536
+    if text not in ("", "auto") and not meant:
         raise UserError(
             f"--distributed {text}: must be auto (Slurm, Open MPI or Kubernetes tell the rest) or "
             "HOST:PORT,I/N, which is process I of 0 to N - 1 and where process 0 listens"
@@ -85,7 +86,11 @@ def meet(coordinator: str, count: int, index: int, wait_s: float) -> None:
                     raise OSError(f"nobody listens at {coordinator} after {wait_s:g} s") from None
                 time.sleep(0.2)
     with contextlib.ExitStack() as stack:
-        server = stack.enter_context(socket.create_server(("", int(port))))
+        both = socket.has_dualstack_ipv6()
+        family = socket.AF_INET6 if both else socket.AF_INET
+        server = stack.enter_context(
+            socket.create_server(("", int(port)), family=family, dualstack_ipv6=both)
+        )
         come: list[socket.socket] = []
         while len(come) < count - 1:
             server.settimeout(max(until - time.monotonic(), 0.01))

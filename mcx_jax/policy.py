@@ -21,7 +21,7 @@ from flax import struct, traverse_util
 from mcx_jax import interface
 from mcx_jax.assets import policy_file
 from mcx_jax.errors import UserError
-from mcx_jax.ppo.networks import Carry, Params, PolicyNet, init_params, step
+from mcx_jax.ppo.networks import CELLS, Carry, Params, PolicyNet, init_params, step
 from mcx_jax.ppo.networks import init_carry as zero_carry
 from mcx_jax.ppo.normalise import RunningStats, init_stats, normalise_obs
 
@@ -220,7 +220,7 @@ def _meta(path: Path, text: np.ndarray | None) -> PolicyMeta:
     try:
         values = json.loads(str(text))
         kind, version = values.pop("kind"), values.pop("format")
-    except (ValueError, KeyError, AttributeError, RecursionError):
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         raise foreign from None
     if kind != KIND:
         raise foreign
@@ -232,6 +232,10 @@ def _meta(path: Path, text: np.ndarray | None) -> PolicyMeta:
     except (TypeError, ValueError, RecursionError):
         raise foreign from None
     sizes = meta.obs_size, meta.action_size, meta.hidden
-    if not known or not all(type(n) is int and 0 < n <= MAX_SIZE for n in sizes):
+    if (
+        not known
+        or meta.cell not in tuple(CELLS)
+        or not all(type(n) is int and 0 < n <= MAX_SIZE for n in sizes)
+    ):
         raise foreign
     return meta

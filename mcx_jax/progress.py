@@ -38,6 +38,10 @@ def references(config: TrainConfig) -> tuple[str, str]:
     return position, angle
 
 
+LEFT_OUT = {"ppo": "windows", "first-order": "steps"}
+"""What an algorithm leaves out of learning (`rejected_share`)."""
+
+
 @dataclass
 class Progress:
     """Prints the state of a run that starts at `start_iteration`."""
@@ -87,8 +91,12 @@ class Progress:
         share = max(row["rejected_share"] for row in rows)
         if share > REJECTED_WARNING and not self.warned:
             self.warned = True
+            limit = self.config.ppo.reject_mean_sq_reward
+            why = {
+                "ppo": f"failed IK or a mean squared reward above --reject-mean-sq-reward {limit}",
+                "first-order": "failed IK, or the tool or a joint's speed out of all bounds",
+            }
             self.out.write(
-                f"warning: {100 * share:.0f} % of the windows are left out of learning: failed IK "
-                "or a mean squared reward above --reject-mean-sq-reward "
-                f"{self.config.ppo.reject_mean_sq_reward}\n"
+                f"warning: {100 * share:.0f} % of the {LEFT_OUT[self.config.algo]} are left out of "
+                f"learning: {why[self.config.algo]}\n"
             )

@@ -115,7 +115,7 @@ def effort(correction: np.ndarray, torque_share: np.ndarray) -> dict[str, Any]:
         },
         "torque_share": {
             "mean": float(np.nanmean(share)),
-            "at_limit": float(np.nanmean(share > 1.0 - 1e-6)),
+            "at_limit": float(np.mean(share[np.isfinite(share)] > 1.0 - 1e-6)),
         },
     }
 

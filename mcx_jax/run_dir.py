@@ -17,7 +17,7 @@ from typing import Any
 
 from mcx_jax import checkpoint, cli
 from mcx_jax.config import TrainConfig
-from mcx_jax.errors import UserError
+from mcx_jax.errors import UserError, reason
 
 CONFIG = "config.json"
 METRICS = "metrics.jsonl"
@@ -59,6 +59,11 @@ class RunDir:
                 raise UserError(
                     f"{self.path}: another process is training here; wait for it, or name another "
                     "--run-dir"
+                ) from None
+            except OSError as error:
+                raise UserError(
+                    f"{self.path}: this file system cannot lock files ({reason(error)}); name a "
+                    "--run-dir on one that can"
                 ) from None
             if (self.path / CONFIG).exists():
                 _refuse_difference(self.path, self.config)
@@ -212,5 +217,5 @@ def writing(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise UserError(
-            f"{path}: cannot be written ({error.strerror}); mend this, then go on with --resume"
+            f"{path}: cannot be written ({reason(error)}); mend this, then go on with --resume"
         ) from None

@@ -104,9 +104,13 @@ def _require_gpu(jax) -> None:
 
 
 def run_command(main: Callable[[], None]) -> None:
-    """Run a command's `main`: a `UserError` becomes one line on stderr and exit code 2."""
+    """Run a command's `main`: a `UserError` becomes one line on stderr and exit code 2, Ctrl-C
+    ends with code 130."""
     try:
         main()
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        print("\nstopped", file=sys.stderr)
+        raise SystemExit(130) from None

@@ -4,6 +4,7 @@
 """
 
 import contextlib
+import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -77,7 +78,8 @@ def save(run: RunDir, state: "TrainState", rows: list[dict[str, Any]]) -> "tuple
     from mcx_jax.policy import save_policy
 
     policies = policies_of(run.config, state)
-    best = max(range(len(policies)), key=lambda k: rows[k]["reward"] if rows else 0.0)
+    rewards = [row["reward"] for row in rows] or [0.0] * len(policies)
+    best = max(range(len(policies)), key=lambda k: (math.isfinite(rewards[k]), rewards[k]))
     if run.writes:
         with writing(run.path):
             if len(policies) > 1:
@@ -122,8 +124,9 @@ def iterate(
         progress.show(rows)
         watch.after_iteration(state, rows)
         overdue = time.monotonic() - saved > checkpoint_interval_s
-        stop.signum, overdue = hosts.agree(stop.signum, overdue)
-        if stop.signum:
+        signum, overdue = hosts.agree(stop.signum, overdue)
+        if signum:  # not stored unless there is one: a signal that came meanwhile is kept
+            stop.signum = signum
             break
         if overdue and not watch.lost:
             watch.check(state, rows)

@@ -239,6 +239,7 @@ def test_mjx_refuses_another_plant():
         ("", "two rows"),
         ("t,x,y,z\n0,0,0,0\n", "two rows"),
         ("0,0,0\n1,0,0\n", "four"),
+        ("0,0\n0.1,0.01\n0.2,0.02\n0.3,0.01\n", "four"),
         ("0,0,0,0\n0,0,0,0\n", "increase"),
         ("0,0,0,0\n1,nan,0,0\n", "finite"),
         ("\x00\x01\x02", "needs|table"),

@@ -10,6 +10,7 @@ import pytest
 from mcx_jax import fitted
 from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
 from mcx_jax.envs.v2v import make_env
+from mcx_jax.errors import UserError
 
 SEA = MotionConfig(sea="Wc")
 QUIET = EnvConfig(delay="E1", integrator="implicitfast", episode_steps=100)
@@ -55,6 +56,28 @@ def test_no_motion_asks_for_no_correction(small):
     memory, action = fir.act(env, state, fir.init(env, state))
     np.testing.assert_allclose(action, np.zeros(6), atol=1e-4)
     assert memory.shape == (fitted.TAPS, 12)
+
+
+@pytest.mark.parametrize("who", ["extrapolate-best", "fir"])
+def test_a_lead_that_diverges_is_never_the_best(who, monkeypatch):
+    env = make_env(QUIET, SEA, split="train")
+    monkeypatch.setattr(fitted, "fit_fir", lambda env, lead_s: lead_s)
+    scores = iter([0.3, np.nan, 0.2, *[0.4] * (len(fitted.LEADS_S) - 3)])
+    monkeypatch.setattr(fitted, "_score", lambda env, controller: next(scores))
+    chosen = fitted.fitted(who, env)
+    lead_s = chosen if who == "fir" else float(chosen.lead_s)
+    assert lead_s == pytest.approx(env.known_delay.group_delay_s + fitted.LEADS_S[2])
+    monkeypatch.setattr(fitted, "_score", lambda env, controller: np.nan)
+    with pytest.raises(UserError, match=f"{who}: the arm diverges"):
+        fitted.fitted(who, env)
+
+
+def test_a_short_episode_is_fitted_on_motion_that_there_is(small):
+    """Windows end 2 s after the episode; 500 steps would read beyond the table in some."""
+    env = make_env(QUIET, SEA, split="train")
+    keys = jax.random.split(jax.random.key(0), 2)
+    x, _ = fitted._regression(env, keys, jnp.int32(LEAD_STEPS), jnp.int32(0))
+    assert x.shape[1] == 100 + 50 - fitted.TAPS + 1
 
 
 def test_late_measurements_have_weights_of_their_own(small):

@@ -177,6 +177,9 @@ def test_a_diverged_environment_is_cut_and_never_shown(many):
     [
         ({"dely": "E2"}, "unknown setting 'dely': use test or a field of EnvConfig or Motion"),
         ({"delay": "F2"}, "unknown delay 'F2'"),
+        ({"delay": 2}, "setting delay is 2, must be of type str"),
+        ({"physics": "MJX"}, "setting physics is 'MJX', must be one of chain, mjx"),
+        ({"split": "Paper"}, "setting split is 'Paper', must be one of seeds, paper"),
         ({"num_envs": 0}, "num_envs 0: must be a positive integer"),
     ],
 )

@@ -118,7 +118,18 @@ def test_two_processes(repo_root, place, pair):
 
 
 @pytest.mark.parametrize(
-    "text", ["here", "host,0/2", "host:1,2/2", "host:1,0", "host:1,-1/2", "a b:1,0/2", "host:1,0/0"]
+    "text",
+    [
+        "here",
+        "host,0/2",
+        "host:1,2/2",
+        "host:1,0",
+        "host:1,-1/2",
+        "a b:1,0/2",
+        "host:1,0/0",
+        "host:0,0/2",
+        "host:99999,0/2",
+    ],
 )
 def test_places_that_cannot_be_meant(text):
     with pytest.raises(UserError, match="must be auto .* or HOST:PORT,I/N"):

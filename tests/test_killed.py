@@ -51,9 +51,9 @@ def whole(lives):
 
 @pytest.mark.slow
 def test_killed_twenty_times(lives, whole):
-    """12 kills at operations on files (a checkpoint is 50 to 70 of them, so in the first or second),
-    12 at random times (an iteration and its checkpoint take 0.1 to 0.2 s; the run is long enough
-    for a machine four times as fast)."""
+    """12 kills at operations on files (a checkpoint is 50 to 70 of them), 12 at random times (an
+    iteration and its checkpoint take 0.1 to 0.2 s; the run is long enough for a machine four times
+    as fast)."""
     draw = random.Random(20230207)
     kinds = [f"event:{draw.randint(1, 100)}" for _ in range(12)]
     kinds += [f"after:{draw.uniform(0.0, 0.5):.3f}" for _ in range(12)]

@@ -35,7 +35,7 @@ from mcx_jax.spatial import unpack
 
 STEPS, EPISODE, SEED = 60, 2, 4
 # The quiet integrator, so that rounding stays rounding.
-TASK = EnvConfig(delay="E1", integrator="implicitfast", episode_steps=STEPS)
+TASK = EnvConfig(delay="E1,E2", integrator="implicitfast", episode_steps=STEPS)
 MOTION = MotionConfig(sea="Wd")
 
 
@@ -53,7 +53,10 @@ def test_an_episode_is_evaluates(env, take):
     both = errors_beside_ik(
         "extrapolate", CLASSICAL["extrapolate"], env, episodes=EPISODES, seed=SEED
     )
-    assert take.names == ("ik", "extrapolate") and take.sea == "Wd" and take.delay == "E1"
+    assert take.names == ("ik", "extrapolate") and take.sea == "Wd"
+    key = jax.random.split(jax.random.key(SEED), EPISODES)[EPISODE]
+    drawn = int(env.draw(key)[2].delay)
+    assert take.delay == ("E1 (20 ms)", "E2 (40 ms)")[drawn]
     for errors, poses in zip(both, take.poses, strict=True):
         np.testing.assert_allclose(poses.pos_error_m, errors.pos_m[:, 0, EPISODE], atol=2e-5)
         np.testing.assert_allclose(poses.ang_error_rad, errors.ang_rad[:, 0, EPISODE], atol=2e-5)

@@ -102,8 +102,9 @@ def test_foreign(tmp_path):
     path = tmp_path / "other.npz"
     np.savez(path, x=np.zeros(3))
     _refused(path, "{path}: not a policy file of mcx_jax (no metadata of its kind)")
-    np.savez(path, metadata="3")
-    _refused(path, "{path}: not a policy file of mcx_jax (no metadata of its kind)")
+    for metadata in ("3", "[]"):
+        np.savez(path, metadata=metadata)
+        _refused(path, "{path}: not a policy file of mcx_jax (no metadata of its kind)")
     np.save(tmp_path / "array.npy", np.zeros(3))
     _refused(tmp_path / "array.npy", "{path}: not a policy file of mcx_jax, or cut short")
 
@@ -120,6 +121,14 @@ def test_of_another_format(saved):
         metadata = json.loads(str(file["metadata"]))
     _rewrite(saved, metadata=json.dumps({**metadata, "format": 9}))
     _refused(saved, "{path}: policy file of format 9; this version reads 1")
+
+
+@pytest.mark.parametrize("cell", ["rnn", 3, ["lstm"]])
+def test_of_an_unknown_cell(saved, cell):
+    with np.load(saved) as file:
+        metadata = json.loads(str(file["metadata"]))
+    _rewrite(saved, metadata=json.dumps({**metadata, "cell": cell}))
+    _refused(saved, "{path}: not a policy file of mcx_jax (no metadata of its kind)")
 
 
 @pytest.mark.parametrize("value", [None, np.zeros(4)])

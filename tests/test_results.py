@@ -166,3 +166,5 @@ def test_effort_by_hand():
     assert found["correction"]["rate_cm_s"] == pytest.approx(50.0)
     assert found["correction"]["rate_crad_s"] == pytest.approx(25.0)
     assert found["torque_share"] == pytest.approx({"mean": 0.375, "at_limit": 1 / 6})
+    share[-2] = np.nan  # a diverged point is no point
+    assert effort(correction, share)["torque_share"]["at_limit"] == pytest.approx(1 / 4)

@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
+from mcx_jax.config import TrainConfig
+from mcx_jax.env_config import MotionConfig
+from mcx_jax.envs.motion import load_motion
 from mcx_jax.errors import UserError
-from mcx_jax.sea.recording import load_recording, split_recording
+from mcx_jax.sea.recording import MIN_DURATION_S, load_recording, split_recording
 from mcx_jax.sea.spectrum import SEAS
 from mcx_jax.sea.tables import build_tables
 
@@ -76,7 +79,13 @@ def test_froude_scale(tmp_path):
     # accelerations: 10 m / 10 s^2 = 1, angles stay
     with pytest.raises(UserError, match="sample rate 31.6 Hz|too short") as error:
         load_recording(save(tmp_path / "full.npy", data), scale=20.0)
-    assert "it needs at least 125 s" in str(error.value)  # 411 s / sqrt 20 = 92 s
+    assert "it needs at least 128 s" in str(error.value)  # 411 s / sqrt 20 = 92 s
+
+
+@pytest.mark.parametrize("split", ["train", "test"])
+def test_the_shortest_recording_holds_a_training_episode(tmp_path, split):
+    path = save(tmp_path / "short.npy", record(MIN_DURATION_S, 20.0))
+    load_motion(MotionConfig(motion=str(path)), TrainConfig().env.episode_steps, split)
 
 
 def test_lowest_rate_is_accepted(tmp_path):
@@ -105,7 +114,6 @@ def test_split_two_thirds_one_third(tmp_path):
     train, test = split_recording(tables)
     np.testing.assert_array_equal(train.knots, tables.knots[:, :2001])  # 0 .. 200 s
     np.testing.assert_array_equal(test.knots, tables.knots[:, 2200:])  # 220 .. 300 s
-    assert test.last_start(10_000) == 29_999
     short = load_recording(save(tmp_path / "s.npy", record(50.0)), min_duration_s=10.0)
     with pytest.raises(UserError) as error:
         split_recording(short)
@@ -140,8 +148,8 @@ BAD_ARRAYS = {
     "inf": (_edit(_put(9, 0, np.inf)), "t is inf in row 10; all entries must be finite numbers"),
     "columns": (record()[:, :6], "has 6 columns; it needs the 7 columns t,x,y,z,roll,pitch,yaw"),
     "flat": (record()[:, 0], "has shape (13001,); it needs the 7 columns"),
-    "no rows": (record()[:0], "too short: fewer than two rows; it needs at least 125 s"),
-    "one row": (record()[:1], "too short: fewer than two rows; it needs at least 125 s"),
+    "no rows": (record()[:0], "too short: fewer than two rows; it needs at least 128 s"),
+    "one row": (record()[:1], "too short: fewer than two rows; it needs at least 128 s"),
     "order": (_edit(_put(7, 0, 0.01)), "time does not increase at row 8; sort the rows"),
     "uneven": (
         np.delete(record(), slice(500, 503), axis=0),
@@ -149,7 +157,7 @@ BAD_ARRAYS = {
     ),
     "short": (
         record(100.0),
-        "too short: 100.0 s (after Froude scaling); it needs at least 125 s",
+        "too short: 100.0 s (after Froude scaling); it needs at least 128 s",
     ),
     "slow": (
         record(rate_hz=5.0),

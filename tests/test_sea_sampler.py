@@ -7,6 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mcx_jax.delay import SUBSTEPS
+from mcx_jax.env_config import MotionConfig
+from mcx_jax.envs.motion import LOOK_AHEAD_STEPS, load_motion
 from mcx_jax.sea.sampler import (
     KNOT_STEPS,
     PHYSICS_DT_S,
@@ -123,9 +126,9 @@ def test_interpolation_error_against_every_second_knot():
 
 
 def test_last_start_window_stays_inside_its_table():
-    tables = build_tables([SEAS["Wa"]], "test", split="paper")
-    last = tables.last_start(10_000) + 10_000
-    assert last // KNOT_STEPS + 1 == tables.knots.shape[1] - 1
+    motion = load_motion(MotionConfig(sea="Wa", split="paper"), 1000, "test")
+    last = SUBSTEPS * (motion.last_start + 1000 + LOOK_AHEAD_STEPS)
+    assert last // KNOT_STEPS + 1 == motion.knots_a.shape[1] - 1
 
 
 def matrix(rpy):

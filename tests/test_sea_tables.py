@@ -79,8 +79,6 @@ def test_tables_close_and_have_their_shape(train):
     assert train.sea_index.tolist() == [s for s in range(4) for _ in range(8)]
     assert train.sea_names == ("Wa", "Wb", "Wc", "Wd")
     assert train.duration_s == pytest.approx(3600.0)
-    # 3600 s of 500 steps, less the window of 10,000 steps, less the last instant
-    assert train.last_start(10_000) == 1_789_999
 
 
 def test_froude_scaling_keeps_accelerations(train):

@@ -54,6 +54,16 @@ def test_a_users_mistake_is_one_line_and_code_2(capsys):
     assert capsys.readouterr().err == "error: what, allowed, do\n"
 
 
+def test_ctrl_c_is_one_line_and_code_130(capsys):
+    def main():
+        raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit) as stop:
+        run_command(main)
+    assert stop.value.code == 130
+    assert capsys.readouterr().err == "\nstopped\n"
+
+
 def test_import_sets_no_flag():
     code = (
         "import os, mcx_jax.train, mcx_jax.evaluate; "

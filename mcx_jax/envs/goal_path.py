@@ -99,7 +99,10 @@ def _read(name: str, path: Path) -> np.ndarray:
         lines = [words for words in lines if not words[0].lstrip().startswith("#")]
         if lines and not _is_number(lines[0][0]):
             lines = lines[1:]
-        return np.array([[float(word) for word in words] for words in lines]).reshape(-1, 4)
+        rows = [[float(word) for word in words] for words in lines]
+        if any(len(row) != 4 for row in rows):
+            raise ValueError
+        return np.array(rows).reshape(-1, 4)
     except (ValueError, OSError):
         raise UserError(f"--goal {name}: not a table of four numbers a row, t,x,y,z") from None
 

@@ -10,7 +10,6 @@ import math
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 
 from mcx_jax.delay import NYQUIST_HZ, Delay
@@ -74,20 +73,13 @@ def init(delay: Delay, first: jax.Array) -> LagState:
     Args:
         first: (nq,) joint reference, rad.
     """
-    state = [
-        # Steady state of TDF-II for a constant x with unit DC gain of every section.
-        jnp.stack([(gain - b0) * first, (b2 - a2 * gain) * first])
-        for b0, b1, b2, a1, a2 in sections(delay)
-        for gain in [(b0 + b1 + b2) / (1.0 + a1 + a2)]
+    # Steady state of TDF-II; every section has gain 1 at 0 Hz, so the same input.
+    settled = [
+        jnp.stack([(1.0 - b0) * first, (b2 - a2) * first]) for b0, _, b2, _, a2 in sections(delay)
     ]
-    # Sections other than the first see the previous section's output: scale by the gain so far.
-    gains = np.cumprod(
-        [1.0] + [(s[0] + s[1] + s[2]) / (1.0 + s[3] + s[4]) for s in sections(delay)]
-    )
-    scaled = [g * s for g, s in zip(gains, state, strict=False)]
     return LagState(
         queue=jnp.broadcast_to(first, (delay.steps, *first.shape)),
-        sections=jnp.stack(scaled) if scaled else jnp.zeros((0, 2, *first.shape), first.dtype),
+        sections=jnp.stack(settled) if settled else jnp.zeros((0, 2, *first.shape), first.dtype),
     )
 
 

@@ -28,10 +28,8 @@ class Motion:
     """Name of each sea; tables are ordered [sea, seed]."""
     seeds: int = struct.field(pytree_node=False)
     """Tables per sea."""
-    first_start: int = struct.field(pytree_node=False)
-    """Earliest window start, control steps of 20 ms."""
     last_start: int = struct.field(pytree_node=False)
-    """Latest window start, control steps of 20 ms (inclusive)."""
+    """Latest window start, control steps of 20 ms (inclusive); the earliest is 0."""
     coupled: bool = struct.field(pytree_node=False, default=False)
     """Both vessels use the same window (one wave field)."""
 
@@ -57,18 +55,18 @@ def draw_track(motion: Motion, uniform: jax.Array, sea: jax.Array | int | None =
         sea: index into motion.seas; None draws one.
     """
     if sea is None:
-        sea = _pick(uniform[0], 0, len(motion.seas))
-    seed = _pick(uniform[1], 0, motion.seeds)
-    low, high = motion.first_start, motion.last_start + 1
-    start_a = SUBSTEPS * _pick(uniform[2], low, high)
-    start_b = start_a if motion.coupled else SUBSTEPS * _pick(uniform[3], low, high)
+        sea = _pick(uniform[0], len(motion.seas))
+    seed = _pick(uniform[1], motion.seeds)
+    starts = motion.last_start + 1
+    start_a = SUBSTEPS * _pick(uniform[2], starts)
+    start_b = start_a if motion.coupled else SUBSTEPS * _pick(uniform[3], starts)
     table = jnp.asarray(sea * motion.seeds + seed, jnp.int32)
     return Track(table=table, start_a=start_a, start_b=start_b)
 
 
-def _pick(uniform: jax.Array, low: int, high: int) -> jax.Array:
-    """An int32 in [low, high); float32 has 2^23 steps, forty times an hour of starts."""
-    return jnp.minimum(low + jnp.floor(uniform * (high - low)).astype(jnp.int32), high - 1)
+def _pick(uniform: jax.Array, count: int) -> jax.Array:
+    """An int32 in [0, count); float32 has 2^23 steps, forty times an hour of starts."""
+    return jnp.minimum(jnp.floor(uniform * count).astype(jnp.int32), count - 1)
 
 
 def load_motion(
@@ -96,7 +94,6 @@ def load_motion(
         knots_b=device_a if knots_b is None else jnp.asarray(knots_b, jnp.float32),
         seas=names,
         seeds=knots_a.shape[0] // len(names),
-        first_start=0,
         last_start=last_start,
         coupled=config.coupled,
     )

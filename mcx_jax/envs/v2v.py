@@ -364,3 +364,14 @@ def _check_arm(name: str, mj: MjModel, model: ChainModel) -> None:
         raise UserError(f"--arm {name}: every joint needs exactly one position servo actuator")
     if any(not act.bias[1] and not act.bias[2] for act in model.actuators):
         raise UserError(f"--arm {name}: torque motors are not driven here; use servo actuators")
+    if any(act.gear != 1.0 or -act.gain not in act.bias[1:] for act in model.actuators):
+        raise UserError(
+            f"--arm {name}: a servo would not settle where it is told; use <position> and "
+            "<velocity> actuators without gear"
+        )
+    down = (0.0, 0.0, -vessels.GRAVITY_M_S2)
+    if max(abs(x - y) for x, y in zip(model.gravity, down, strict=True)) > 0.02:
+        raise UserError(
+            f"--arm {name}: its gravity is {' '.join(f'{x:g}' for x in model.gravity)}; at sea it "
+            f"is 0 0 {down[2]:g} in the frame of the base, leave it out of the file"
+        )

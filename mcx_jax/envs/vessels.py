@@ -14,6 +14,8 @@ from flax import struct
 from mcx_jax.delay import SUBSTEPS
 from mcx_jax.envs.motion import Motion, Track
 from mcx_jax.sea.sampler import KNOT_STEPS, body_rates, hermite, segment_rows
+from mcx_jax.sea.spectrum import GRAVITY_M_S2
+from mcx_jax.sea.tables import SEPARATION_X_M
 from mcx_jax.spatial import (
     Mat,
     Scalar,
@@ -31,8 +33,7 @@ from mcx_jax.spatial import (
 )
 from mcx_jax.stage import stage
 
-GRAVITY_M_S2 = 9.81
-REST_B_M: Vec = (0.65, 0.0, 0.0)
+REST_B_M: Vec = (SEPARATION_X_M, 0.0, 0.0)
 """Vessel B's rest position (authors' code); vessel A rests at the origin."""
 REST_B: Mat = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
 """Vessel B is turned 180 deg about z: the vessels face each other."""
@@ -93,6 +94,17 @@ def base_state(
     return stage(wall, seen_from_deck, turns, xd[3:], xdd)
 
 
+def poses(
+    seg_a: Segment, seg_b: Segment, i: int | jax.Array
+) -> tuple[tuple[Mat, Vec], tuple[Mat, Vec]]:
+    """((R, p) of A, (R, p) of B): the decks' poses in the world I at physics step i, m."""
+    xa, _, _ = seg_a.at(i)
+    xb, _, _ = seg_b.at(i)
+    r_a = rotation_rpy(xa[3], xa[4], xa[5])
+    r_b = matmul(REST_B, rotation_rpy(xb[3], xb[4], xb[5]))
+    return (r_a, (xa[0], xa[1], xa[2])), (r_b, vadd(REST_B_M, (xb[0], xb[1], xb[2])))
+
+
 def goal_in_base(
     seg_a: Segment, seg_b: Segment, goal_m: jax.Array, i: int | jax.Array
 ) -> tuple[Mat, Vec]:
@@ -101,17 +113,10 @@ def goal_in_base(
     Args:
         goal_m: (3,) position of the goal on vessel B, m.
     """
-    xa, _, _ = seg_a.at(i)
-    xb, _, _ = seg_b.at(i)
-    r_a = rotation_rpy(xa[3], xa[4], xa[5])
-    r_b = matmul(REST_B, rotation_rpy(xb[3], xb[4], xb[5]))
-    p_b = vadd(REST_B_M, (xb[0], xb[1], xb[2]))
+    (r_a, p_a), (r_b, p_b) = poses(seg_a, seg_b, i)
     goal = vadd(p_b, matvec(r_b, unpack(goal_m, 3)))
     to_base = transpose(r_a)
-    return (
-        matmul(matmul(to_base, r_b), GOAL_ROTATION),
-        matvec(to_base, vsub(goal, (xa[0], xa[1], xa[2]))),
-    )
+    return matmul(matmul(to_base, r_b), GOAL_ROTATION), matvec(to_base, vsub(goal, p_a))
 
 
 def goal_pose(motion: Motion, track: Track, goal_m: jax.Array, step: jax.Array) -> tuple[Mat, Vec]:

@@ -19,6 +19,7 @@ from flax import struct
 
 from mcx_jax.config import TrainConfig
 from mcx_jax.envs.chain import SMOOTH
+from mcx_jax.ppo.loss import reported_mean
 from mcx_jax.ppo.networks import init_params, step
 from mcx_jax.ppo.normalise import RunningStats, init_stats, merge, normalise_obs
 from mcx_jax.ppo.rollout import Actors, init_actors, insert_block, replace_broken, step_all
@@ -182,12 +183,8 @@ def iterate(
 def _metrics(metrics: Any, stats: Any, lr: jax.Array, reset_envs: jax.Array) -> IterationMetrics:
     valid = metrics.valid.astype(jnp.float32)
     learned = jnp.any(metrics.valid) & jnp.any(stats.skipped == 0)
-    count = jnp.maximum(jnp.sum(valid), 1.0)
-
-    def mean(x: jax.Array) -> jax.Array:
-        return jnp.sum(jnp.where(metrics.valid, x, 0.0)) / count
-
-    position, angle = mean(metrics.pos_error_m), mean(metrics.ang_error_rad)
+    position = reported_mean(metrics.pos_error_m, valid)
+    angle = reported_mean(metrics.ang_error_rad, valid)
     return IterationMetrics(
         pos_error_mm=1e3 * position,
         ang_error_mrad=1e3 * angle,

@@ -17,7 +17,6 @@ from mcx_jax.envs.motion import Motion, Track
 from mcx_jax.envs.state import EnvState
 from mcx_jax.envs.v2v import V2VEnv
 from mcx_jax.report.episode import side_by_side
-from mcx_jax.spatial import matmul, rotation_rpy, vadd
 
 EPISODES = 50
 """Episodes to choose from: those of `evaluate` with its default `--episodes`."""
@@ -49,6 +48,8 @@ class Poses:
     start_a: Any
     """(steps,) int32 where vessel A's window begins in the table, physics steps of 2 ms."""
     start_b: Any
+    delay: Any
+    """(steps,) int32 which of the environment's delays; the same all the time."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class Take:
     poses: tuple[Poses, ...]
     """Of each."""
     delay: str
-    """As the environment calls it."""
+    """That the episode has: its name and how late it makes slow motion."""
     sea: str
     """Name of the sea state."""
 
@@ -94,16 +95,16 @@ def simulate(
     key = jax.random.split(jax.random.key(seed), EPISODES)[episode]
     both = side_by_side(env, controller, key, sea, _sample)
     names = ("ik",) if who == "ik" else ("ik", who)
-    return Take(names, both[: len(names)], env.config.delay, env.motion.seas[sea])
+    delay = env.delays[int(both[0].delay[0])]
+    said = f"{delay.name} ({1e3 * delay.group_delay_s:.0f} ms)"
+    return Take(names, both[: len(names)], said, env.motion.seas[sea])
 
 
 def vessel_poses(motion: Motion, track: Track, step: jax.Array):
     """World poses ((R, p) of A, (R, p) of B) at a physics step of the episode (m; rad)."""
     seg_a = vessels.segment(motion.knots_a, track.table, track.start_a + step)
     seg_b = vessels.segment(motion.knots_b, track.table, track.start_b + step)
-    xa, xb = seg_a.at(0)[0], seg_b.at(0)[0]
-    r_a, r_b = rotation_rpy(*xa[3:]), matmul(vessels.REST_B, rotation_rpy(*xb[3:]))
-    return (r_a, xa[:3]), (r_b, vadd(vessels.REST_B_M, (xb[0], xb[1], xb[2])))
+    return vessels.poses(seg_a, seg_b, 0)
 
 
 def _sample(env: V2VEnv, before: EnvState, after: EnvState, action: jax.Array) -> Poses:
@@ -125,4 +126,5 @@ def _sample(env: V2VEnv, before: EnvState, after: EnvState, action: jax.Array) -
         seed=track.table % env.motion.seeds,
         start_a=track.start_a,
         start_b=track.start_b,
+        delay=jnp.int32(0) if after.conditions.delay is None else after.conditions.delay,
     )

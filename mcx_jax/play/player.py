@@ -11,9 +11,9 @@ import numpy as np
 import viser
 
 from mcx_jax.controllers import CLASSICAL
-from mcx_jax.delay import CONTROL_DT_S, NAMED_DELAYS, parse_delay
+from mcx_jax.delay import CONTROL_DT_S, NAMED_DELAYS
 from mcx_jax.envs.v2v import V2VEnv, make_env
-from mcx_jax.errors import UserError
+from mcx_jax.errors import UserError, reason
 from mcx_jax.play.episode import EPISODES, Take, simulate
 from mcx_jax.play.page import APART_M, Tableau, add_light, look_at
 from mcx_jax.play.stage import Stage
@@ -60,7 +60,7 @@ class Player:
                 )
         except OSError as error:
             raise UserError(
-                f"--host {config.host} --port {config.port}: cannot be served ({error.strerror})"
+                f"--host {config.host} --port {config.port}: cannot be served ({reason(error)})"
             ) from None
         self.stage = Stage(config.env)
         add_light(self.server)
@@ -141,7 +141,6 @@ class Player:
         for control in self._controls:
             control.disabled = True
         self.server.flush()
-        delay = parse_delay(choice.delay)
         env = self.env.with_delay(choice.delay)
         take = simulate(
             env,
@@ -162,19 +161,20 @@ class Player:
             if not self._config.motion.motion
             else self._surface.note
         )
-        self._said.content = self._headline(choice, delay.group_delay_s, take)
+        self._said.content = self._headline(choice, take)
         for control in self._controls:
             control.disabled = False
 
-    def _headline(self, choice: Choice, delay_s: float, take: Take) -> str:
+    def _headline(self, choice: Choice, take: Take) -> str:
         means = ", ".join(
             f"{who} {1e3 * poses.pos_error_m.mean():.2f} mm"
             for who, poses in zip(take.names, take.poses, strict=True)
         )
         trained = self._trained_for.get(choice.who)
-        warning = f" **Trained for {trained}.**" if trained not in (None, choice.delay) else ""
+        strange = trained and not set(choice.delay.split(",")) <= set(trained.split(","))
+        warning = f" **Trained for {trained}.**" if strange else ""
         return (
-            f"Delay {take.delay} ({1e3 * delay_s:.0f} ms), sea {take.sea}, episode "
+            f"Delay {take.delay}, sea {take.sea}, episode "
             f"{choice.episode}. Mean error: {means}.{warning}"
         )
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from mcx_jax.delay import CONTROL_DT_S
 from mcx_jax.env_config import EnvConfig, MotionConfig
-from mcx_jax.errors import UserError
+from mcx_jax.errors import UserError, reason
 from mcx_jax.play.episode import Take
 from mcx_jax.play.picture import HEIGHT_PX, WIDTH_PX, Picture
 from mcx_jax.play.stage import Painter, Stage
@@ -22,10 +22,10 @@ STRIDE = 2
 FPS = round(1 / (STRIDE * CONTROL_DT_S))
 
 
-def title(take: Take, delay_ms: float) -> str:
+def title(take: Take) -> str:
     """What the picture shows."""
     what = "Tool on vessel A, goal on vessel B"
-    return f"{what}  |  delay {take.delay} ({delay_ms:.0f} ms)  |  sea {take.sea}"
+    return f"{what}  |  delay {take.delay}  |  sea {take.sea}"
 
 
 def write_film(
@@ -52,7 +52,7 @@ def write_film(
                     say(f"frame {frame + 1} of {len(steps)}, about {left_s:.0f} s left")
         partial.replace(path)
     except OSError as error:
-        raise UserError(f"--video {path}: cannot be written ({error.strerror})") from None
+        raise UserError(f"--video {path}: cannot be written ({reason(error)})") from None
     finally:
         partial.unlink(missing_ok=True)
     return len(steps)
@@ -97,7 +97,7 @@ def write_frame(path: Path, take: Take, env: EnvConfig, motion: MotionConfig, at
     try:
         image.save(path)
     except OSError as error:
-        raise UserError(f"--frame {path}: cannot be written ({error.strerror})") from None
+        raise UserError(f"--frame {path}: cannot be written ({reason(error)})") from None
 
 
 @contextlib.contextmanager
@@ -107,6 +107,5 @@ def _picture(
     """The pictures of these control steps; the renderer is given back at the end."""
     stage = Stage(env)
     water = surface(take, motion, take.time_s[steps])
-    line = title(take, 1e3 * env.delays[0].group_delay_s)
     with Painter(stage, WIDTH_PX, HEIGHT_PX, fine=fine) as painter:
-        yield Picture(take, water, stage, painter, line)
+        yield Picture(take, water, stage, painter, title(take))

@@ -10,6 +10,11 @@ def masked_mean(x: jax.Array, mask: jax.Array) -> jax.Array:
     return jnp.sum(jnp.where(mask > 0, x, 0.0)) / jnp.maximum(jnp.sum(mask), 1.0)
 
 
+def reported_mean(x: jax.Array, mask: jax.Array) -> jax.Array:
+    """`masked_mean` for people: NaN if the mask is nowhere 1."""
+    return jnp.where(jnp.any(mask > 0), masked_mean(x, mask), jnp.nan)
+
+
 def standardise(x: jax.Array, mask: jax.Array) -> jax.Array:
     """Mean 0 and deviation 1 over the entries with mask 1; 0 elsewhere."""
     mean = masked_mean(x, mask)

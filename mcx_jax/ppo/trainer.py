@@ -13,7 +13,7 @@ from flax import struct
 
 from mcx_jax.config import PPOConfig, TrainConfig
 from mcx_jax.ppo.experience import Judged, judge
-from mcx_jax.ppo.loss import masked_mean
+from mcx_jax.ppo.loss import masked_mean, reported_mean
 from mcx_jax.ppo.networks import Networks, init_params, make_networks
 from mcx_jax.ppo.normalise import RunningStats, init_stats, merge
 from mcx_jax.ppo.rollout import Actors, Window, collect, init_actors, insert_block, replace_broken
@@ -52,7 +52,8 @@ class IterationMetrics:
     """What an iteration reports; all () float32.
 
     Attributes:
-        pos_error_mm: mean position error over the valid steps, exploration noise included.
+        pos_error_mm: mean position error over the valid steps, exploration noise included; NaN if
+            there is none.
         ang_error_mrad: mean orientation error over the same.
         reward: mean reward over the same.
         invalid_share: share of steps that are not valid.
@@ -222,9 +223,9 @@ def _metrics(
     value_moved = jnp.any(stats.value_step.skipped == 0)
     learned = jnp.any(judged.mask > 0) & policy_moved & value_moved
     return IterationMetrics(
-        pos_error_mm=1e3 * masked_mean(env_metrics.pos_error_m, valid),
-        ang_error_mrad=1e3 * masked_mean(env_metrics.ang_error_rad, valid),
-        reward=masked_mean(window.steps.reward, valid),
+        pos_error_mm=1e3 * reported_mean(env_metrics.pos_error_m, valid),
+        ang_error_mrad=1e3 * reported_mean(env_metrics.ang_error_rad, valid),
+        reward=reported_mean(window.steps.reward, valid),
         invalid_share=1.0 - jnp.mean(valid),
         rejected_share=1.0 - jnp.mean(judged.mask),
         kl=stats.surrogate.kl[last],

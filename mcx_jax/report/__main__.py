@@ -15,7 +15,7 @@ import tyro
 
 from mcx_jax import cli
 from mcx_jax.env_config import EnvConfig, MotionConfig
-from mcx_jax.errors import UserError
+from mcx_jax.errors import UserError, reason
 from mcx_jax.evaluate import EvaluateConfig
 
 PAGE, RESULTS = "index.html", "results.json"
@@ -90,7 +90,7 @@ def main(argv: list[str] | None = None) -> None:
         import matplotlib.figure  # noqa: F401
     except ImportError:
         raise UserError("the report needs matplotlib: pip install 'mcx_jax[viz]'") from None
-    for line in startup.configure(config.device):
+    for line in startup.configure(config.device, mjx=config.env.physics == "mjx"):
         print(line)
     loaded = entries.load_entries(names)
     own = dataclasses.replace(EnvConfig(), **entries.common_settings(loaded, argv))
@@ -117,7 +117,7 @@ def write(out: Path, html: str, pngs: dict[str, bytes], results: dict[str, Any])
             (out / f"{name}.png").write_bytes(data)
         (out / PAGE).write_text(html, encoding="utf-8")
     except OSError as error:
-        raise UserError(f"--out {out}: cannot be written ({error.strerror})") from None
+        raise UserError(f"--out {out}: cannot be written ({reason(error)})") from None
 
 
 if __name__ == "__main__":

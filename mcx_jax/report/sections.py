@@ -92,8 +92,9 @@ def tracking(
     panels, lags = [], []
     for label, e in [("ik", ik), *others]:
         lag = 1e3 * lag_s(e.goal_m[warm], e.tool_m[warm])
-        lags.append(f"{label} {abs(lag):.0f} ms {'late' if lag >= 0 else 'early'}")
-        title = f"{label}: tool {abs(lag):.0f} ms {'late' if lag >= 0 else 'early'} on average"
+        late = f"{abs(lag):.0f} ms {'late' if lag >= 0 else 'early'}"
+        lags.append(f"{label} {late if np.isfinite(lag) else 'diverged'}")
+        title = f"{label}: " + (f"tool {late} on average" if np.isfinite(lag) else "diverged")
         panels.append(
             Panel(
                 f"follow_{len(panels)}",

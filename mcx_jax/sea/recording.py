@@ -25,8 +25,9 @@ from mcx_jax.sea.tables import KNOT_DT_S, SPLIT_GAP_S, MotionTables
 
 COLUMNS = ("t", "x", "y", "z", "roll", "pitch", "yaw")
 MIN_RATE_HZ = 10.0
-# A third of it, less the gap at the border, must still hold an episode of 20.5 s.
-MIN_DURATION_S = 125.0
+# A third of it, less the gap at the border, must still hold an episode of 20.5 s and the 2 s that
+# controllers may look ahead.
+MIN_DURATION_S = 128.0
 # Limits beyond which a number cannot be the unit named: ten times the arm's reach, the roll of a
 # ship about to capsize, half a turn off the mean heading.
 _MAX_DISPLACEMENT_M = 10.0

@@ -59,13 +59,6 @@ class MotionTables:
         """Length of one table, laboratory seconds."""
         return (self.knots.shape[1] - 1) * KNOT_DT_S
 
-    def last_start(self, steps: int) -> int:
-        """Largest start, in physics steps, of a window of `steps`: draw from 0 to this, inclusive.
-
-        Minus one, because the very last instant of a table has no row i + 1.
-        """
-        return (self.knots.shape[1] - 1) * KNOT_STEPS - 1 - steps
-
 
 def table_seed(sea: SeaState, role: Role, index: int) -> int:
     """Seed of a table: a hash, so that no two (sea, role, index) share phases."""
