@@ -583,12 +583,14 @@ def test_a_recording_drives_the_task(tmp_path):
 
 # --- arms that cannot do the task ---------------------------------------------------------------
 
-ARM = """<mujoco><compiler angle="radian"/><option timestep="{dt}"/>
+ARM = """<mujoco><compiler angle="radian"/><option timestep="{dt}" gravity="{gravity}"/>
 <worldbody>{bodies}<site name="tool"/>{close}</worldbody>
 <actuator>{actuators}</actuator></mujoco>"""
 
 
-def arm_file(tmp_path, joints=6, dt="0.002", servo="position", count=None):
+def arm_file(
+    tmp_path, joints=6, dt="0.002", servo="position", count=None, gravity="0 0 -9.81", more=""
+):
     body = "<body pos='0 0 .2'><joint name='j{}' axis='{}'/><geom size='.03' contype='0'"
     bodies = "".join(
         (body + " conaffinity='0'/>").format(i, "0 0 1" if i % 2 else "0 1 0")
@@ -599,9 +601,10 @@ def arm_file(tmp_path, joints=6, dt="0.002", servo="position", count=None):
     path.write_text(
         ARM.format(
             dt=dt,
+            gravity=gravity,
             bodies=bodies,
             close="</body>" * joints,
-            actuators="".join(f"<{servo} joint='j{i}'/>" for i in range(count)),
+            actuators="".join(f"<{servo} joint='j{i}' {more}/>" for i in range(count)),
         )
     )
     return str(path)
@@ -617,6 +620,21 @@ def arm_file(tmp_path, joints=6, dt="0.002", servo="position", count=None):
         ),
         ({"count": 5}, "every joint needs exactly one position servo actuator"),
         ({"servo": "motor"}, "every joint needs exactly one position servo actuator"),
+        (
+            {"more": "gear='2'"},
+            "a servo would not settle where it is told; use <position> and <velocity> actuators "
+            "without gear",
+        ),
+        (
+            {"servo": "general", "more": "gainprm='1' biastype='affine' biasprm='0 -9 0'"},
+            "a servo would not settle where it is told; use <position> and <velocity> actuators "
+            "without gear",
+        ),
+        (
+            {"gravity": "0 0 -1.62"},
+            "its gravity is 0 0 -1.62; at sea it is 0 0 -9.81 in the frame of the base, leave it "
+            "out of the file",
+        ),
     ],
 )
 def test_arms_that_cannot_do_the_task_are_refused(tmp_path, change, message):
