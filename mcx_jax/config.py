@@ -34,7 +34,7 @@ class PPOConfig:
     sequence_steps: int = 32
     """Length of back-propagation through time; divides window_steps."""
     epochs: int = 2
-    """Passes over the collected window in one iteration (policy and value at most that many)."""
+    """Passes over the collected window in one iteration (--target-kl may end the policy's)."""
     minibatches: int = 16
     """Minibatches of whole sequences per pass."""
     gamma: float = 0.9

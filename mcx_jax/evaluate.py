@@ -133,7 +133,7 @@ def evaluate_beside_ik(
         seed: of the windows of motion and the goals; the same for every controller.
 
     Returns:
-        (rows of ik, rows of who), one a sea, as described in the README (section Evaluate).
+        (rows of ik, rows of who), one a sea, as described in the README (section Commands).
 
     Raises:
         UserError: episodes that end within the warm-up.

@@ -40,7 +40,8 @@ class Policy:
         self.state = {k: np.zeros(n, np.float32) for k, n in self.interface["state"].items()}
 
     def step(self, observed) -> np.ndarray:
-        """Observation (38,), not normalised -> action (6,) in cm and crad; advances the memory.
+        """Observation (38,), not normalised; (39,) with the measurement's age, s, for a policy
+        trained with --latency-steps -> action (6,) in cm and crad; advances the memory.
 
         Raises:
             ValueError: wrong length, or a number that is not finite; the memory stays as it was.

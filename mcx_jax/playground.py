@@ -26,7 +26,7 @@ class State:
     data: EnvState
     """This project's own state, not MJX's; learners hand it through unread."""
     obs: jax.Array
-    """(38,) see envs.observe.OBS_TABLE."""
+    """(38,) see envs.observe.OBS_TABLE; (39,) with the measurement's age."""
     reward: jax.Array
     """() -(dp + da), m and rad."""
     done: jax.Array

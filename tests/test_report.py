@@ -240,7 +240,7 @@ def test_refusals(made, tmp_path):
     )
     refused(
         ["--out", out],
-        "name at least one RUN: ik, extrapolate, preview, a run directory or .npz",
+        "name at least one RUN: ik, extrapolate, fir, shipped:DELAY, a run directory or .npz",
     )
     refused(["ik"], "--out is missing: name a directory for the report")
     file = tmp_path / "file"

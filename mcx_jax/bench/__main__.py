@@ -29,7 +29,7 @@ class BenchConfig:
     """How fast everything is on this machine, rivals included, in one run. Let nothing else run."""
 
     quick: bool = False
-    """Fewer batch sizes, no gradient, no cold start: two minutes on two cores once compiled."""
+    """Fewer batch sizes, no gradient, no cold start: 90 s on two cores once compiled."""
     json: str = ""
     """Write the figures to this file; - or no value: to the terminal, and the report to stderr."""
     plot: str = ""

@@ -27,7 +27,7 @@ class Metrics:
     ang_error_rad: jax.Array
     """da: angle between the tool and the goal."""
     ik_error: jax.Array
-    """Remaining IK error, m + rad."""
+    """IK error before its last step, m + rad."""
     valid: jax.Array
     """bool, sticky within an episode: no IK failure, no excess error, all finite."""
 

@@ -1,6 +1,6 @@
 """`python -m mcx_jax.report RUN... --out DIR`: one page about controllers, with all its figures.
 
-RUN is ik, extrapolate, preview, a run directory or a policy file; ik is always there.
+RUN is what `evaluate` takes; ik is always there.
 """
 
 import dataclasses
@@ -27,7 +27,8 @@ class ReportConfig:
     """One self-contained HTML page about controllers, and its figures as PNG files beside it."""
 
     runs: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="RUN ...")] = ()
-    """Any of ik, extrapolate, preview, run directories and policy .npz files."""
+    """Any of ik, extrapolate, extrapolate-best, fir, preview, shipped:DELAY, run directories and
+    policy .npz files."""
     out: str = ""
     """Directory to write to: a new one, an empty one, or an earlier report's."""
     episodes: int = 50

@@ -55,7 +55,9 @@ class Curves:
 def check_names(runs: Sequence[str]) -> tuple[str, ...]:
     """The names to report, `ik` first and none twice; a wrong one is refused before JAX starts."""
     if not runs:
-        raise UserError("name at least one RUN: ik, extrapolate, preview, a run directory or .npz")
+        raise UserError(
+            "name at least one RUN: ik, extrapolate, fir, shipped:DELAY, a run directory or .npz"
+        )
     for who in runs:
         policy_path(who)
     return tuple(dict.fromkeys(["ik", *(who.rstrip("/") for who in runs)]))
