@@ -285,6 +285,23 @@ def test_resume_reads_the_stored_configuration(finished_default):
     assert command.train.num_envs == 64 and run.start_iteration == 2
 
 
+def test_a_signal_while_the_processes_agree_is_kept(tmp_path, monkeypatch):
+    """It comes after this process has said that it has none."""
+    asked = []
+
+    def agree(*numbers):
+        asked.append(numbers)
+        if len(asked) == 1:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return numbers
+
+    monkeypatch.setattr("mcx_jax.training.hosts.agree", agree)
+    with pytest.raises(SystemExit) as stop:
+        train(open_new(tmp_path / "run", CONFIG), _make_env)
+    assert stop.value.code == 128 + signal.SIGTERM
+    assert checkpoint.latest(tmp_path / "run") == len(asked) == 2
+
+
 def test_default_directory():
     config = preset_config("fast")
     assert str(default_path(replace(config, seed=3))) == "runs/B4_4-fast-s3"
