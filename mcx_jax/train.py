@@ -9,7 +9,7 @@ import os
 import sys
 import tempfile
 import uuid
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -28,6 +28,9 @@ from mcx_jax.training import train
 
 if TYPE_CHECKING:
     from mcx_jax.policy import Policy
+
+FIRST_ORDER_USES = ("hidden", "cell", "lr_decay", "max_grad_norm")
+"""Settings of PPO that --algo first-order has, too."""
 
 FINAL_EPISODES, FINAL_STEPS = 50, 1000
 SMOKE_EPISODES, SMOKE_STEPS = 2, 96
@@ -88,6 +91,17 @@ def smoke_config(config: TrainConfig) -> TrainConfig:
     )
 
 
+def _refuse_unused(asked: TrainConfig, defaults: TrainConfig) -> None:
+    """A setting of the other algorithm would be without effect."""
+    other = "first_order" if asked.algo == "ppo" else "ppo"
+    ours, theirs = getattr(asked, other), getattr(defaults, other)
+    for setting in fields(ours):
+        name = setting.name
+        if name not in FIRST_ORDER_USES and getattr(ours, name) != getattr(theirs, name):
+            flag = f"--{name.replace('_', '-')} {getattr(ours, name)}"
+            raise UserError(f"{flag} has no meaning with --algo {asked.algo}; leave it out")
+
+
 def read_command(argv: list[str]) -> tuple[TrainCommand, RunDir]:
     """The command and its checked directory; nothing is written.
 
@@ -102,6 +116,7 @@ def read_command(argv: list[str]) -> tuple[TrainCommand, RunDir]:
     parse = functools.partial(cli.parse, TrainCommand, argv, prog="train")
     command = parse(default=TrainCommand(train=defaults))
     if not command.resume and not command.resume_from:
+        _refuse_unused(command.train, defaults)
         return command, open_new(_directory(command), command.train)
     path = Path(command.run_dir) if command.run_dir else default_path(command.train)
     command = parse(default=TrainCommand(train=stored_config(path)))

@@ -167,6 +167,25 @@ def test_several_seeds(tmp_path, capsys):
     assert set(_contents(path)) == set(before)
 
 
+@pytest.mark.parametrize(
+    ("argv", "flag"),
+    [
+        (["--algo", "first-order", "--policy-lr", "0.01"], "--policy-lr 0.01"),
+        (["--learning-rate", "0.01"], "--learning-rate 0.01"),
+        (["--algo", "first-order", "--smoke", "--minibatches", "1"], "--minibatches 1"),
+    ],
+)
+def test_a_setting_of_the_other_algorithm_is_refused(argv, flag, tmp_path, capsys):
+    algo = "first-order" if "--algo" in argv else "ppo"
+    run = tmp_path / "run"
+    assert _refused([*argv, "--run-dir", str(run)], capsys) == (
+        f"{flag} has no meaning with --algo {algo}; leave it out"
+    )
+    assert not run.exists()
+    shared = ["--algo", "first-order", "--hidden", "32", "--cell", "gru", "--num-envs", "100"]
+    assert read_command([*shared, "--run-dir", str(run)])[0].train.ppo.hidden == 32
+
+
 def _refused(argv, capsys):
     """Exit code 2 and one line on stderr; returns the line."""
     with pytest.raises(SystemExit) as stop:
