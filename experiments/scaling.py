@@ -22,11 +22,11 @@ from mcx_jax.startup import DEVICES_FLAG, PASSES_FLAG, SPLIT_PASS
 ENVS_PER_DEVICE = 1024
 WINDOW_STEPS = 32
 ITERATIONS = 6
-ROWS = ((1, 1), (1, 2), (2, 1), (1, 4), (1, 8))
-"""(processes, devices of each)."""
+ROWS = ((1, 1, True), (1, 2, True), (2, 1, True), (2, 1, False), (1, 4, True), (1, 8, True))
+"""(processes, devices of each, whether every process is bound to as many cores)."""
 
 
-def steps_per_s(processes: int, devices: int) -> float:
+def steps_per_s(processes: int, devices: int, bound: bool) -> float:
     """Control steps a second of a run."""
     cores = sorted(os.sched_getaffinity(0))
     envs = ENVS_PER_DEVICE * processes * devices
@@ -39,8 +39,7 @@ def steps_per_s(processes: int, devices: int) -> float:
         command += ["--total-steps", str(ITERATIONS * WINDOW_STEPS * envs), "--run-dir", folder]
         children = []
         for i in range(processes):
-            # A device is a core: without this one device would be given all of them.
-            mine = cores[i * devices : (i + 1) * devices] or cores
+            mine = (cores[i * devices : (i + 1) * devices] if bound else None) or cores
             several = ["--distributed", f"{place},{i}/{processes}"] if processes > 1 else []
             children.append(
                 subprocess.Popen(
@@ -64,15 +63,17 @@ def steps_per_s(processes: int, devices: int) -> float:
 
 def main() -> None:
     rows, alone = [], None
-    for processes, devices in ROWS:
-        rate = steps_per_s(processes, devices)
+    for processes, devices, bound in ROWS:
+        rate = steps_per_s(processes, devices, bound)
         alone = alone or rate
         ideal = alone * min(processes * devices, os.cpu_count() or 1)
-        print(f"{processes} x {devices} devices: {rate:,.0f} steps/s, {100 * rate / ideal:.0f} %")
+        where = "" if bound else ", not bound to cores"
+        print(f"{processes} x {devices}{where}: {rate:,.0f} steps/s, {100 * rate / ideal:.0f} %")
         rows.append(
             {
                 "processes": processes,
                 "devices_each": devices,
+                "bound": bound,
                 "num_envs": ENVS_PER_DEVICE * processes * devices,
                 "steps_per_s": f"{rate:.0f}",
                 "share_of_linear_percent": f"{100 * rate / ideal:.0f}",

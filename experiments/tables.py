@@ -367,7 +367,8 @@ def scaling() -> str:
         return "not measured yet (`python experiments/scaling.py`)"
     rows = [
         [
-            f"{r['processes']} x {r['devices_each']}",
+            f"{r['processes']} x {r['devices_each']}"
+            + (", not bound to cores" if r.get("bound") == "False" else ""),
             r["num_envs"],
             f"{float(r['steps_per_s']) / 1e3:.1f} k",
             f"{r['share_of_linear_percent']} %",
