@@ -40,8 +40,7 @@ class Policy:
         self.state = {k: np.zeros(n, np.float32) for k, n in self.interface["state"].items()}
 
     def step(self, observed) -> np.ndarray:
-        """Observation (38,), not normalised; (39,) with the measurement's age, s, for a policy
-        trained with --latency-steps -> action (6,) in cm and crad; advances the memory.
+        """Raw observation (38,), (39,) with its age in s -> action (6,), cm, crad; advances memory.
 
         Raises:
             ValueError: wrong length, or a number that is not finite; the memory stays as it was.
