@@ -56,7 +56,9 @@ def over_seeds(name: str) -> list[dict[str, str]]:
             for key in rows[0]
             if key.startswith(("pos_mm", "ang_mrad", "gain_")) and not key.endswith("_paper")
         }
-        out.append({**rows[0], **mean, "seeds": str(len(rows))})
+        # Seeds of one call share its seconds.
+        seconds = sum(float(s) for s in {r["train_seconds"] for r in rows})
+        out.append({**rows[0], **mean, "seeds": str(len(rows)), "train_seconds": f"{seconds:.0f}"})
     return out
 
 
@@ -132,6 +134,7 @@ def controllers() -> str:
         label = who
         if "trained" in first:
             label = f"{who}, {int(first['steps']) / 1e6:.1f} M steps, {first['train_seconds']} s"
+            label += f" for {first['seeds']} seeds" if first["seeds"] != "1" else ""
         values = [
             f"{float(cells[s]['pos_mm']):.2f} mm, {float(cells[s]['ang_mrad']):.2f} mrad"
             for s in SEAS
@@ -163,7 +166,9 @@ def agents() -> str:
             for unit in ("pos_mm", "ang_mrad"):
                 row += [f"{float(r[unit]):.2f} / {r[unit + '_paper']}" for r in mine]
             steps, minutes = int(mine[0]["steps"]) / 1e6, float(mine[0]["train_seconds"]) / 60
-            rows.append([*row, f"{steps:.1f} M steps, {minutes:.1f} min", mine[0]["seeds"]])
+            each = " each" if mine[0]["seeds"] != "1" else ""
+            trained = f"{steps:.1f} M steps{each}, {minutes:.1f} min"
+            rows.append([*row, trained, mine[0]["seeds"]])
         if not rows:
             continue
         header = [what, *(f"{s} mm" for s in SEAS), *(f"{s} mrad" for s in SEAS)]
