@@ -421,6 +421,7 @@ TABLES = {
     "controllers": controllers,
     "agents": agents,
     "robust": robust,
+    "goals": goals,
     "long_run": long_run,
     "speed": speed,
     "scaling": scaling,
