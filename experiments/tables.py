@@ -239,8 +239,8 @@ def _mean_and_max(r: dict[str, str]) -> str:
 
 
 def growth(rows: list[dict]) -> str:
-    """Resident memory of a long run over time, and what was traced or compiled (the larger of two
-    samples around an instant: a checkpoint is being written in some)."""
+    """Resident memory of a long run over time (the largest of three samples around an instant:
+    single ones are lower by 200 MiB), and what was traced or compiled."""
     minutes = [float(r["minute"]) for r in rows]
     mib = [float(r["resident_mib"]) for r in rows]
 

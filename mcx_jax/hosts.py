@@ -32,7 +32,8 @@ def check(text: str) -> None:
     if text not in ("", "auto") and not meant:
         raise UserError(
             f"--distributed {text}: must be auto (Slurm, Open MPI or Kubernetes tell the rest) or "
-            "HOST:PORT,I/N, which is process I of 0 to N - 1 and where process 0 listens"
+            "HOST:PORT,I/N, which is process I of 0 to N - 1 and where process 0 listens "
+            "(port 1 to 65535)"
         )
 
 

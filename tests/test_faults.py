@@ -19,7 +19,6 @@ from mcx_jax.env_config import EnvConfig
 from mcx_jax.errors import UserError
 from mcx_jax.ppo.rollout import replace_broken
 from mcx_jax.programs import Training, prepare
-from mcx_jax.progress import LEFT_OUT
 from mcx_jax.run_dir import open_existing, open_new
 from mcx_jax.sharding import env_mesh
 from mcx_jax.training import train
@@ -234,9 +233,10 @@ def test_ten_lost_iterations_end_the_run(algo, tmp_path, monkeypatch, capsys):
     message = str(error.value)
     # PPO: the other half was just renewed. First-order: half in the first window, then all.
     skipped, reset = (8, 32) if algo == "ppo" else (2, 48)
+    what = "windows" if algo == "ppo" else "steps"
     assert message == (
         f"{path}: stopped at iteration 13: nothing was learned in 10 iterations in a row (in the "
-        f"last one 100 % of the {LEFT_OUT[algo]} were left out, {skipped} updates skipped, "
+        f"last one 100 % of the {what} were left out, {skipped} updates skipped, "
         f"{reset} environments reset); the checkpoint of iteration 3 is kept, the states "
         f"are in {path / 'diverged-13.npz'}; start another run with a smaller step size or another "
         "--seed"

@@ -103,6 +103,15 @@ def test_one_process_a_run(tmp_path, capsys):
         pass
 
 
+def test_a_file_system_without_locks(tmp_path, monkeypatch):
+    def refuse(*args):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr("mcx_jax.run_dir.fcntl.flock", refuse)
+    with pytest.raises(UserError, match=r"cannot lock files \(No locks available\); name a"):
+        train(open_new(tmp_path / "run", CONFIG), _make_env)
+
+
 def test_started_twice_at_the_same_time(tmp_path):
     """Both saw an empty directory; the second comes when the first has been there and gone."""
     path = tmp_path / "run"

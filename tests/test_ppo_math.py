@@ -13,6 +13,7 @@ from mcx_jax.ppo.loss import (
     explained_variance,
     huber,
     masked_mean,
+    reported_mean,
     standardise,
     value_loss,
 )
@@ -135,6 +136,7 @@ def test_masked_mean_and_standardise():
     x, mask = jnp.array([1.0, 3.0, jnp.nan]), jnp.array([1.0, 1.0, 0.0])
     assert masked_mean(x, mask) == 2.0
     assert masked_mean(x, jnp.zeros(3)) == 0.0
+    assert reported_mean(x, mask) == 2.0 and jnp.isnan(reported_mean(x, jnp.zeros(3)))
     np.testing.assert_allclose(standardise(x, mask), [-1.0, 1.0, 0.0], rtol=1e-6)
 
 
