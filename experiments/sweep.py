@@ -4,7 +4,7 @@
 
 Runs are kept in runs/ under the names that `train` gives them and gone on with if they are not
 finished; one run a seed, as tools/sweep.sbatch makes them, does as well. --quiet: with the
-integrator implicitfast, "-quiet" in the names. Writes experiments/ppo.csv or first_order.csv
+integrator quiet, "-quiet" in the names. Writes experiments/ppo.csv or first_order.csv
 (..._quiet.csv): rows of `ik` and of every seed, for the delays named and those that the file has.
 """
 
@@ -40,7 +40,7 @@ def trained(algo: str, delay: str, seeds: int, quiet: bool, options: list[str]) 
             run = RUNS / f"{stem}-s{first}{last}"
             command += ["--run-dir", str(run), "--algo", algo, "--delay", delay]
             command += ["--seed", str(first), "--seeds", str(seeds - first), *options]
-            command += ["--integrator", "implicitfast"] * quiet
+            command += ["--integrator", "quiet"] * quiet
         if not begun or latest(run) != stored_config(run).iterations:
             print(" ".join(command), flush=True)
             subprocess.run(command, check=True)

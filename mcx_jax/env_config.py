@@ -101,9 +101,10 @@ class EnvConfig:
     """Name of the site in the arm model that is the tool centre point E."""
     physics: Literal["chain", "mjx"] = "chain"
     """Engine: chain (this project's, fast) or mjx (MuJoCo's own, the reference)."""
-    integrator: Literal["model", "euler", "implicitfast", "mixed"] = "model"
+    integrator: Literal["model", "euler", "implicitfast", "quiet", "mixed"] = "model"
     """Integrator of the arm; model = as the arm's file says (paper: euler, ur10e: implicitfast);
-    mixed = euler or implicitfast, drawn per episode."""
+    quiet = implicitfast as it was before MuJoCo 3.5, the one that does not chatter; mixed = euler
+    or implicitfast, drawn per episode."""
     episode_steps: int = 1000
     """Control steps of 20 ms in an episode."""
     goal: str = "static"

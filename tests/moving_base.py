@@ -73,16 +73,16 @@ def acceleration(
     return np.linalg.solve(full[6:, 6:] + np.diag(np.broadcast_to(implicit, len(q))), rhs)
 
 
-def implicit_damping(fixed: mujoco.MjModel, q, qd, ctrl) -> np.ndarray:
+def implicit_damping(fixed: mujoco.MjModel, q, qd, ctrl, at_limits: bool = False) -> np.ndarray:
     """(nq,) what implicitfast adds to the mass matrix: step times the servos' velocity derivative,
-    none at a force limit. `fixed` is the arm on a fixed base."""
+    none at a force limit (unless `at_limits`). `fixed` is the arm on a fixed base."""
     d = scratch(fixed)
     d.qpos[:], d.qvel[:], d.ctrl[:] = q, qd, ctrl
     mujoco.mj_fwdPosition(fixed, d)
     mujoco.mj_fwdVelocity(fixed, d)
     mujoco.mj_fwdActuation(fixed, d)
     limit = np.where(fixed.actuator_forcelimited, fixed.actuator_forcerange[:, 1], np.inf)
-    inside = np.abs(d.actuator_force) < limit
+    inside = at_limits | (np.abs(d.actuator_force) < limit)
     slope = -fixed.actuator_biasprm[:, 2] * inside
     implicit = np.zeros(fixed.nv)
     np.add.at(implicit, fixed.actuator_trnid[:, 0], fixed.opt.timestep * slope)

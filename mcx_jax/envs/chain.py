@@ -35,8 +35,8 @@ def actuate(
         limited: False leaves out the limits of commands and forces.
 
     Returns:
-        (torque N m, damping N m s/rad), one of each a joint. The damping of an actuator at its
-        force limit is left out, as MuJoCo's implicitfast does.
+        (torque N m, damping N m s/rad), one of each a joint. With limits, the damping of an
+        actuator at its force limit is left out.
     """
     torque = [mul(-link.damping, rate) for link, rate in zip(model.links, qd, strict=True)]
     damping: list[Scalar] = [link.damping for link in model.links]
@@ -84,12 +84,15 @@ def joint_accelerations(
 ) -> tuple[Scalar, ...]:
     """The acceleration that MuJoCo's integrator multiplies by the time step, rad/s2.
 
-    euler: M + h D with the joints' own damping D; implicitfast: the actuators' velocity derivative
-    as well (for a model without damping, euler's is the forward dynamics); mixed: as the plant
-    says.
+    euler: M + h D with the joints' own damping D (without any, this is the forward dynamics).
+    implicitfast: the actuators' velocity derivative as well, but for those at their force limit.
+    quiet: for these, too, as MuJoCo's implicitfast was until 3.4.0; 3.5.0 left them out, and the
+    velocity servo of this arm has chattered under implicitfast ever since: it is at its limit 0.06
+    rad/s off its command, and 56 N m on 1 kg m2 are twice that in one step of 2 ms.
+    mixed: euler or implicitfast, as the plant says.
 
-    euler-smooth, implicitfast-smooth, mixed-smooth: the same values with the derivative of an
-    implicitfast step whose servos have no limits. The true derivative is useless here: a jump of 1
+    With the ending -smooth: the same values with the derivative of a quiet step whose servos have
+    no limits. The true derivative is useless here: a jump of 1
     mrad in a command already takes a servo of kp 1e5 to its torque limit, where the derivative by
     the command is 0 and that by the state the free arm's, which grows. What brings the arm to its
     reference within the control step is the switching, which no derivative sees. (Over 20 control
@@ -113,15 +116,18 @@ def _accelerations(
     bias = stage(wall, partial(bias_forces, model), angles, qd, base)
     matrix = stage(wall, partial(mass_matrix, model), angles)
     torque, slopes = actuate(model, q, qd, ctrl)
+    unlimited = actuate(model, q, qd, ctrl, limited=False)[1]
     rhs = [sub(t, b) for t, b in zip(torque, bias, strict=True)]
 
     def factored(damping):
         return stage(wall, factor, _stiffened(matrix, damping, model.timestep_s))
 
-    factors = factored(_damping(model, integrator.removesuffix(SMOOTH), slopes, plant))
+    name = integrator.removesuffix(SMOOTH)
+    slopes = unlimited if name == "quiet" else slopes
+    factors = factored(_damping(model, name, slopes, plant))
     value = tuple(stage(wall, solve, factors, rhs))
-    if integrator.endswith(SMOOTH):
-        factors = factored(actuate(model, q, qd, ctrl, limited=False)[1])
+    if name != integrator and name != "quiet":  # whose factors are these already
+        factors = factored(unlimited)
     return value, (value, factors, angles)
 
 
@@ -132,7 +138,7 @@ def _damping(model: ChainModel, integrator: str, slopes: list[Scalar], plant: Pl
         assert plant is not None
         share = plant.implicit
         return [add(p, mul(share, sub(s, p))) for p, s in zip(passive, slopes, strict=True)]
-    return {"euler": passive, "implicitfast": slopes}[integrator]
+    return {"euler": passive, "implicitfast": slopes, "quiet": slopes}[integrator]
 
 
 def _accelerations_forward(model, integrator, motors, base, wall, plant):

@@ -20,6 +20,7 @@ from mcx_jax.envs.dynamics import BaseState
 INTEGRATORS = {
     "euler": mujoco.mjtIntegrator.mjINT_EULER,
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "quiet": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
 }
 
 
@@ -38,7 +39,7 @@ def put_model(mj: mujoco.MjModel, integrator: str) -> mjx.Model:
 
 
 def servo(
-    m: mjx.Model, q: jax.Array, qd: jax.Array, ctrl: jax.Array
+    m: mjx.Model, q: jax.Array, qd: jax.Array, ctrl: jax.Array, integrator: str
 ) -> tuple[mjx.Model, jax.Array]:
     """The same actuators written so that MJX's own formula gives C's force and derivative.
 
@@ -46,13 +47,15 @@ def servo(
     1. A position servo (bias[1] = -gain) of kp 1e5 subtracts two float32 products of 3e5 N m, 1e-4
        rad/s of noise a step. Its command is counted from the joint angle instead: ctrl - length
        with bias[1] = 0, so one product of the small difference.
-    2. implicitfast in C leaves out the velocity derivative of a force at its limit, MJX keeps it.
-       At the limit the actuator becomes a constant: bias = (limit, 0, 0), command 0.
+    2. implicitfast in C leaves out the velocity derivative of a force at its limit, MJX keeps it,
+       as is wanted for the integrator `quiet` alone. At the limit the actuator becomes a constant:
+       bias = (limit, 0, 0), command 0.
 
     Args:
         q: (nq,) joint angles, rad.
         qd: (nq,) joint velocities, rad/s.
         ctrl: (nu,) commands.
+        integrator: as `chain.joint_accelerations`.
 
     Returns:
         (model, commands) for `mjx.step`; control limits are applied here.
@@ -68,6 +71,8 @@ def servo(
     force = gain * command + bias[:, 0] + bias[:, 1] * length + bias[:, 2] * velocity
     limit = _clip(force, m.actuator_forcelimited, m.actuator_forcerange)
     at_limit = affine & (force != limit)  # a motor has no bias to be rewritten and no derivative
+    if integrator == "quiet":
+        at_limit = jnp.zeros_like(at_limit)
     constant = jnp.zeros_like(bias).at[:, 0].set(limit)
     bias = jnp.where(at_limit[:, None], constant, bias)
     return m.replace(actuator_biasprm=bias), jnp.where(at_limit, 0.0, command)
@@ -109,13 +114,19 @@ def substeps(
     ctrl: jax.Array,
     base_at: Callable[[jax.Array], BaseState],
     count: int,
+    *,
+    integrator: str,
 ) -> tuple[jax.Array, jax.Array]:
-    """`count` physics steps; arguments and result as `chain.substeps`."""
+    """`count` physics steps; arguments and result as `chain.substeps`.
+
+    Args:
+        integrator: the one that the model was put with.
+    """
     blank = mjx.make_data(m)
 
     def body(i, state):
         q, qd = state
-        actuated, commands = servo(m, q, qd, ctrl)
+        actuated, commands = servo(m, q, qd, ctrl, integrator)
         d = blank.replace(qpos=q, qvel=qd, ctrl=commands)
         d = mjx.com_vel(m, mjx.com_pos(m, mjx.kinematics(m, d)))
         d = mjx.step(actuated, d.replace(xfrc_applied=inertial_wrenches(m, d, base_at(i))))

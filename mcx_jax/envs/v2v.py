@@ -52,7 +52,8 @@ class V2VEnv:
     known_delay: Delay = struct.field(pytree_node=False)
     """What a controller without learning believes the delay to be."""
     integrator: str = struct.field(pytree_node=False)
-    """euler, implicitfast or mixed; with the chain engine also these with the ending -smooth."""
+    """euler, implicitfast, quiet or mixed; the ending -smooth changes the chain engine's derivative
+    (`chain.joint_accelerations`)."""
     goal_path: GoalPath | None = None
     """None: the goal stays where it is drawn."""
     whole_batches: bool = struct.field(pytree_node=False, default=False)
@@ -279,7 +280,11 @@ class V2VEnv:
             from mcx_jax.envs import mjx_engine
 
             base_at = lambda i: vessels.base_state(seg_a, i, self.wall)  # noqa: E731
-            q, qd = mjx_engine.substeps(self.mjx_model, arm.q, arm.qd, ctrl, base_at, count)
+            integrator = self.integrator.removesuffix(chain.SMOOTH)  # MJX has its own derivative
+            state = arm.q, arm.qd
+            q, qd = mjx_engine.substeps(
+                self.mjx_model, *state, ctrl, base_at, count, integrator=integrator
+            )
         return ArmState(q=q, qd=qd)
 
 
