@@ -1,8 +1,9 @@
 """The controllers without learning on the paper's five delays and four seas.
 
-    python experiments/baseline.py ik extrapolate extrapolate-best fir preview
+    python experiments/baseline.py [--quiet] ik extrapolate extrapolate-best fir preview
 
-Writes experiments/baseline_WHO.csv; for `ik` prints how close it is to the baseline that the
+Writes experiments/baseline_WHO.csv, with --quiet (the integrator quiet) baseline_WHO_quiet.csv; for
+`ik` in the paper's world prints how close it is to the baseline that the
 paper's table 3 implies (rms of the 40 log ratios, worst cell).
 """
 
@@ -22,19 +23,21 @@ def main() -> None:
     from mcx_jax.evaluate import evaluate
     from mcx_jax.roster import WHO, fit_if_needed, load_controller
 
-    names = sys.argv[1:] or ["ik"]
+    quiet = "--quiet" in sys.argv
+    names = [word for word in sys.argv[1:] if word != "--quiet"] or ["ik"]
     if unknown := set(names) - set(WHO):
         raise SystemExit(f"unknown controller {unknown}: use {', '.join(WHO)}")
     for who in names:
         rows = []
         for delay in NAMED_DELAYS:
             begun = time.monotonic()
-            env, motion = EnvConfig(delay=delay), MotionConfig()
+            env = EnvConfig(delay=delay, integrator="quiet" if quiet else "model")
+            motion = MotionConfig()
             controller = fit_if_needed(who, load_controller(who)[1], env, motion, "")
             found = evaluate(who, controller, env, motion)
             rows += evaluation_rows(found, time.monotonic() - begun)
             print(f"{who} {delay}: {time.monotonic() - begun:.0f} s", flush=True)
-        if who == "ik":
+        if who == "ik" and not quiet:
             ratios = [
                 math.log(float(r[name]) / float(r[f"{name}_paper"]))
                 for r in rows
@@ -43,7 +46,8 @@ def main() -> None:
             rms = math.sqrt(sum(x * x for x in ratios) / len(ratios))
             worst = max(ratios, key=abs)
             print(f"rms log ratio {rms:.3f}, worst cell {100 * (math.exp(worst) - 1):+.1f} %")
-        write_rows(f"baseline_{who}", [{**r, **provenance()} for r in rows])
+        name = f"baseline_{who}" + "_quiet" * quiet
+        write_rows(name, [{**r, **provenance()} for r in rows])
 
 
 if __name__ == "__main__":

@@ -54,7 +54,7 @@ def main() -> None:
 
     for read in (read_log, read_said):
         threading.Thread(target=read, daemon=True).start()
-    rows = []
+    rows, origin = [], provenance()
     while process.poll() is None:
         time.sleep(PERIOD_S)
         if seen["training"]:
@@ -63,11 +63,12 @@ def main() -> None:
                     "minute": f"{(time.monotonic() - begun) / 60:.1f}",
                     "resident_mib": f"{resident_mib(process.pid):.1f}",
                     "compilations": seen["compilations"],
+                    **origin,
                 }
             )
     if not rows:
         raise SystemExit(process.returncode or "shorter than one sample")
-    write_rows("long_run", [{**row, **provenance()} for row in rows])
+    write_rows("long_run", rows)
     print(growth(rows))
 
 

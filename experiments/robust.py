@@ -49,7 +49,7 @@ class Row:
     delay: str = "B4_4"
     payload_kg: float = 0.0
     wrist_inertia: float = 1.0
-    implicit: float = 0.0
+    quiet: float = 0.0
     sea: str = ""
     """"" = the four of the paper."""
     coupled: bool = False
@@ -64,7 +64,7 @@ ROWS = (
     *(Row(f"delay {name}", delay=name) for name in DELAYS[1:]),
     *(Row(f"payload {x:g} kg", payload_kg=x) for x in (1, 2, 5)),
     *(Row(f"wrist inertia x {x:g}", wrist_inertia=x) for x in (0.1, 0.02)),
-    Row("integrator implicitfast", implicit=1.0),
+    Row("integrator quiet", quiet=1.0),
     Row("sea 3.0:11", sea="3.0:11"),
     Row("coupled sea", coupled=True),
 )
@@ -74,7 +74,7 @@ def conditions_of(rows: list[Row], keys: jax.Array) -> Conditions:
     """One per row; leaves (rows,)."""
     column = lambda name: jnp.asarray([getattr(r, name) for r in rows], jnp.float32)  # noqa: E731
     return Conditions(
-        plant=Plant(column("payload_kg"), column("wrist_inertia"), column("implicit")),
+        plant=Plant(column("payload_kg"), column("wrist_inertia"), column("quiet")),
         noise=Noise(1e-3 * column("noise_mm"), 1e-3 * column("noise_mrad"), keys),
         latency=column("latency_steps").astype(jnp.int32),
         delay=jnp.asarray([DELAYS.index(r.delay) for r in rows], jnp.int32),

@@ -33,13 +33,8 @@ def read(name: str) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-CLASSICAL = (
-    "baseline_ik",
-    "baseline_extrapolate",
-    "baseline_extrapolate-best",
-    "baseline_fir",
-    "baseline_preview",
-)
+LEARNS_NOTHING = ("ik", "extrapolate", "extrapolate-best", "fir")
+"""Controllers that see what an agent sees."""
 
 
 def over_seeds(name: str) -> list[dict[str, str]]:
@@ -120,8 +115,8 @@ def baseline() -> str:
 def controllers() -> str:
     """B4_4: everybody side by side."""
     everyone = []
-    for name in CLASSICAL:
-        everyone += [r for r in read(name) if r["delay"] == "B4_4"]
+    for who in (*LEARNS_NOTHING, "preview"):
+        everyone += [r for r in read(f"baseline_{who}") if r["delay"] == "B4_4"]
     for name in ("ppo", "first_order"):
         trained = [r for r in over_seeds(name) if r["who"] != "ik" and r["delay"] == "B4_4"]
         everyone += [{**r, "trained": r["steps"]} for r in trained]
@@ -156,7 +151,8 @@ def agents() -> str:
     for name, what in (
         ("ppo", "PPO, the paper's world"),
         ("first_order", "first-order, the paper's world"),
-        ("first_order_quiet", "first-order, implicitfast"),
+        ("first_order_quiet", "first-order, the quiet world"),
+        ("first_order_implicitfast", "first-order, implicitfast"),
     ):
         cells = {(r["delay"], r["sea"]): r for r in over_seeds(name) if r["who"] != "ik"}
         rows = []
@@ -182,7 +178,31 @@ def agents() -> str:
             found = f"{len(below)} of {6 * len(worst)} below the paper's"
             found += ": " + ", ".join(below) if below else ""
             blocks.append(f"Improvements of top 5 %, top 1 % and maximum over `ik`: {found}.")
+        blocks += _beside_classical(cells, "_quiet" if name.endswith("_quiet") else "")
     return "\n\n".join(blocks) or "not measured yet (`python experiments/sweep.py ppo`)"
+
+
+def _beside_classical(cells: dict[tuple[str, str], dict[str, str]], world: str) -> list[str]:
+    """How agents compare, cell by cell, with the best of the controllers without learning."""
+    best: dict[tuple[str, str, str], float] = {}
+    for who in LEARNS_NOTHING:
+        for row in read(f"baseline_{who}{world}"):
+            for unit in ("pos_mm", "ang_mrad"):
+                cell = row["delay"], row["sea"], unit
+                best[cell] = min(best.get(cell, math.inf), float(row[unit]))
+    if len(best) < 2 * len(cells):
+        return []
+    said = []
+    for unit, what in (("pos_mm", "position"), ("ang_mrad", "orientation")):
+        shares = {key: float(row[unit]) / best[(*key, unit)] for key, row in cells.items()}
+        worst = max(shares, key=lambda key: shares[key])
+        third = sum(share <= 1 / 3 for share in shares.values())
+        said.append(
+            f"{what} {min(shares.values()):.2f} to {shares[worst]:.2f} of its error "
+            f"({' '.join(worst)}), at most a third in {third} of {len(shares)} cells"
+        )
+    names = ", ".join(f"`{who}`" for who in LEARNS_NOTHING)
+    return [f"Beside the best of {names} in each cell: {'; '.join(said)}."]
 
 
 def _over_seeds_line(name: str) -> list[str]:
@@ -286,7 +306,7 @@ def robust() -> str:
     return "\n\n".join([table, " ".join(said), "Source: " + "; ".join(sources)])
 
 
-RIVALS = (("extrapolate",), ("ik", "extrapolate", "extrapolate-best", "fir"))
+RIVALS = (("extrapolate",), LEARNS_NOTHING)
 
 
 def _lead(cells: dict[tuple[str, str], dict[str, str]], rivals: tuple[str, ...]) -> str:

@@ -104,7 +104,7 @@ class EnvConfig:
     integrator: Literal["model", "euler", "implicitfast", "quiet", "mixed"] = "model"
     """Integrator of the arm; model = as the arm's file says (paper: euler, ur10e: implicitfast);
     quiet = implicitfast as it was before MuJoCo 3.5, the one that does not chatter; mixed = euler
-    or implicitfast, drawn per episode."""
+    or quiet, drawn per episode."""
     episode_steps: int = 1000
     """Control steps of 20 ms in an episode."""
     goal: str = "static"

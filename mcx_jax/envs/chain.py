@@ -89,7 +89,7 @@ def joint_accelerations(
     quiet: for these, too, as MuJoCo's implicitfast was until 3.4.0; 3.5.0 left them out, and the
     velocity servo of this arm has chattered under implicitfast ever since: it is at its limit 0.06
     rad/s off its command, and 56 N m on 1 kg m2 are twice that in one step of 2 ms.
-    mixed: euler or implicitfast, as the plant says.
+    mixed: euler or quiet, as the plant says.
 
     With the ending -smooth: the same values with the derivative of a quiet step whose servos have
     no limits. The true derivative is useless here: a jump of 1
@@ -123,7 +123,7 @@ def _accelerations(
         return stage(wall, factor, _stiffened(matrix, damping, model.timestep_s))
 
     name = integrator.removesuffix(SMOOTH)
-    slopes = unlimited if name == "quiet" else slopes
+    slopes = slopes if name == "implicitfast" else unlimited
     factors = factored(_damping(model, name, slopes, plant))
     value = tuple(stage(wall, solve, factors, rhs))
     if name != integrator and name != "quiet":  # whose factors are these already
@@ -136,7 +136,7 @@ def _damping(model: ChainModel, integrator: str, slopes: list[Scalar], plant: Pl
     passive = [link.damping for link in model.links]
     if integrator == "mixed":
         assert plant is not None
-        share = plant.implicit
+        share = plant.quiet
         return [add(p, mul(share, sub(s, p))) for p, s in zip(passive, slopes, strict=True)]
     return {"euler": passive, "implicitfast": slopes, "quiet": slopes}[integrator]
 

@@ -69,7 +69,7 @@ def draw(config: EnvConfig, key: jax.Array, path_steps: int) -> Conditions:
         plant = Plant(
             payload_kg=_between(ranges["payload_kg"], uniform[0]),
             wrist_inertia=_between_logs(ranges["wrist_inertia"], uniform[1]),
-            implicit=jnp.round(uniform[2]),
+            quiet=jnp.round(uniform[2]),
         )
     if asked.noisy:
         noise = Noise(

@@ -17,8 +17,8 @@ class Plant:
     """() point mass at the tool site."""
     wrist_inertia: jax.Array
     """() factor of the last link's rotational inertia about its centre of mass."""
-    implicit: jax.Array
-    """() 1 = implicitfast, 0 = Euler; read by the integrator `mixed` alone."""
+    quiet: jax.Array
+    """() 1 = quiet, 0 = Euler; read by the integrator `mixed` alone."""
 
 
 def carried_by(model: ChainModel, plant: Plant | None) -> ChainModel:
