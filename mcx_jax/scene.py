@@ -11,9 +11,7 @@ import mujoco
 import numpy as np
 
 from mcx_jax.assets import asset_path
-
-START_POSE_RAD = (-0.1, -1.0, 2.4, -2.9, -1.5, 0.0)
-"""Joint angles (6,) from which the first inverse kinematics starts (the authors' code)."""
+from mcx_jax.envs.arm import START_POSE_RAD
 
 REACH_POSE_RAD = (-0.271, -1.3039, 2.2268, -2.4937, -1.5708, -0.271)
 """Joint angles (6,) that put the tool on the goal of the scene's rest pose, for still pictures."""

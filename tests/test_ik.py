@@ -13,8 +13,8 @@ from moving_base import arm_path
 from scipy.spatial.transform import Rotation
 
 from mcx_jax.envs import ik, vessels
+from mcx_jax.envs.arm import START_POSE_RAD
 from mcx_jax.envs.model import chain_model, load_mujoco
-from mcx_jax.envs.v2v import START_POSE_RAD
 from mcx_jax.spatial import exp_rotation, matmul, unpack, unpack_matrix, vadd
 
 START = np.array(START_POSE_RAD)

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from mcx_jax.delay import MAX_DELAY_S, NYQUIST_HZ, Delay
 from mcx_jax.envs import chain, dynamics, ik, lag, vessels
+from mcx_jax.envs.arm import START_POSE_RAD
 from mcx_jax.envs.model import chain_model, load_mujoco
-from mcx_jax.envs.v2v import START_POSE_RAD
 from mcx_jax.envs.vessels import Segment
 from mcx_jax.sea.sampler import KNOT_STEPS
 from mcx_jax.spatial import matmul, matvec, unpack, unpack_matrix

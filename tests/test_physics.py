@@ -19,8 +19,8 @@ from jax import lax
 from scipy.spatial.transform import Rotation
 
 from mcx_jax.envs import chain, mjx_engine
+from mcx_jax.envs.arm import START_POSE_RAD
 from mcx_jax.envs.model import chain_model, load_mujoco
-from mcx_jax.envs.v2v import START_POSE_RAD
 from mcx_jax.errors import UserError
 from mcx_jax.spatial import unpack
 

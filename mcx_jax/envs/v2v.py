@@ -10,24 +10,21 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 from flax import struct
-from mujoco import MjModel
 
 from mcx_jax.batch_last import batch_last
-from mcx_jax.delay import CONTROL_DT_S, PHYSICS_DT_S, SUBSTEPS, Delay
+from mcx_jax.delay import CONTROL_DT_S, SUBSTEPS, Delay
 from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.envs import chain, conditions, ik, lag, observe, vessels
+from mcx_jax.envs.arm import load_arm, start_pose
 from mcx_jax.envs.conditions import Conditions, Measurement
 from mcx_jax.envs.goal_path import GoalPath, load_goal_path
-from mcx_jax.envs.model import ChainModel, chain_model, load_mujoco
+from mcx_jax.envs.model import ChainModel
 from mcx_jax.envs.motion import Motion, Track, draw_track, load_motion
 from mcx_jax.envs.state import ArmState, EnvState, Metrics
 from mcx_jax.envs.vessels import Segment
-from mcx_jax.errors import UserError
 from mcx_jax.spatial import Mat, Vec, exp_rotation, matmul, matvec, norm, unpack, vadd, vscale
 from mcx_jax.stage import stage
 
-START_POSE_RAD = (-0.1, -1.0, 2.4, -2.9, -1.5, 0.0)
-"""Where the first IK of an episode starts (authors' code)."""
 SETTLE_STEPS = 100
 """Physics steps with the vessels held still before an episode (authors' code)."""
 ACTION_SCALE = 0.01
@@ -118,7 +115,7 @@ class V2VEnv:
             goal = self._goal(seg_a, seg_b, place, 0)
             measured = conditions.first_measurement(drawn, self.config, goal)
         with jax.named_scope("ik"):
-            start = jnp.asarray(_start_pose(self.model), goal_m.dtype)
+            start = jnp.asarray(start_pose(self.model), goal_m.dtype)
             found = self._solve(start, goal, ik.COLD_ITERATIONS)
         with jax.named_scope("settle"):
             arm = ArmState(q=found.q, qd=jnp.zeros_like(found.q))
@@ -317,12 +314,6 @@ def _valid(found: ik.IKResult, arm: ArmState, pos_error_m: jax.Array) -> jax.Arr
     return found.ok & (pos_error_m < MAX_ERROR_M) & (speed < MAX_JOINT_SPEED_RAD_S)
 
 
-def _start_pose(model: ChainModel) -> tuple[float, ...]:
-    if model.nq == len(START_POSE_RAD):
-        return START_POSE_RAD
-    return tuple(0.5 * sum(link.q_range) if link.q_range[1] < 1e9 else 0.3 for link in model.links)
-
-
 def make_env(
     config: EnvConfig, motion_config: MotionConfig, *, split: Literal["train", "test"] = "train"
 ) -> V2VEnv:
@@ -334,9 +325,7 @@ def make_env(
     Raises:
         UserError: the arm or the motion file cannot be used.
     """
-    mj = load_mujoco(config.arm)
-    model = chain_model(mj, config.tool_site)
-    _check_arm(config.arm, mj, model)
+    mj, model = load_arm(config.arm, config.tool_site)
     integrator = model.integrator if config.integrator == "model" else config.integrator
     mjx_model = None
     if config.physics == "mjx":
@@ -353,30 +342,3 @@ def make_env(
         integrator=integrator,
         goal_path=load_goal_path(config.goal),
     )
-
-
-def _check_arm(name: str, mj: MjModel, model: ChainModel) -> None:
-    """Refuse an arm that cannot do this task."""
-    if model.nq < 6:
-        raise UserError(f"--arm {name}: it has {model.nq} joints; a full pose needs at least 6")
-    if abs(model.timestep_s - PHYSICS_DT_S) > 1e-9:
-        raise UserError(
-            f"--arm {name}: its timestep is {model.timestep_s:g} s; set <option timestep="
-            f'"{PHYSICS_DT_S}"/> (500 Hz physics)'
-        )
-    servos = [act.joint for act in model.actuators if act.bias[1]]
-    if sorted(servos) != list(range(model.nq)):
-        raise UserError(f"--arm {name}: every joint needs exactly one position servo actuator")
-    if any(not act.bias[1] and not act.bias[2] for act in model.actuators):
-        raise UserError(f"--arm {name}: torque motors are not driven here; use servo actuators")
-    if any(act.gear != 1.0 or -act.gain not in act.bias[1:] for act in model.actuators):
-        raise UserError(
-            f"--arm {name}: a servo would not settle where it is told; use <position> and "
-            "<velocity> actuators without gear"
-        )
-    down = (0.0, 0.0, -vessels.GRAVITY_M_S2)
-    if max(abs(x - y) for x, y in zip(model.gravity, down, strict=True)) > 0.02:
-        raise UserError(
-            f"--arm {name}: its gravity is {' '.join(f'{x:g}' for x in model.gravity)}; at sea it "
-            f"is 0 0 {down[2]:g} in the frame of the base, leave it out of the file"
-        )
