@@ -40,7 +40,8 @@ def write_rows(name: str, rows: list[dict]) -> None:
 
 def kept(name: str, column: str, anew: list[str]) -> list[dict]:
     """Rows that experiments/NAME.csv has already, but for those with a `column` made anew."""
-    return [row for row in read(name) if row[column] not in anew]
+    stored = read(name) if (FOLDER / f"{name}.csv").is_file() else []
+    return [row for row in stored if row[column] not in anew]
 
 
 def evaluation_rows(rows: list[dict], seconds: float) -> list[dict]:
