@@ -11,7 +11,7 @@ import math
 import sys
 import time
 
-from record import evaluation_rows, provenance, write_rows
+from record import evaluation_rows, kept, provenance, write_rows
 
 from mcx_jax import startup
 from mcx_jax.delay import NAMED_DELAYS
@@ -28,15 +28,18 @@ def main() -> None:
     if unknown := set(names) - set(WHO):
         raise SystemExit(f"unknown controller {unknown}: use {', '.join(WHO)}")
     for who in names:
-        rows = []
+        file = f"baseline_{who}" + "_quiet" * quiet
+        rows: list[dict] = []
         for delay in NAMED_DELAYS:
             begun = time.monotonic()
             env = EnvConfig(delay=delay, integrator="quiet" if quiet else "model")
             motion = MotionConfig()
             controller = fit_if_needed(who, load_controller(who)[1], env, motion, "")
             found = evaluate(who, controller, env, motion)
-            rows += evaluation_rows(found, time.monotonic() - begun)
-            print(f"{who} {delay}: {time.monotonic() - begun:.0f} s", flush=True)
+            seconds = time.monotonic() - begun
+            rows += [{**row, **provenance()} for row in evaluation_rows(found, seconds)]
+            write_rows(file, rows + kept(file, "delay", [row["delay"] for row in rows]))
+            print(f"{who} {delay}: {seconds:.0f} s", flush=True)
         if who == "ik" and not quiet:
             ratios = [
                 math.log(float(r[name]) / float(r[f"{name}_paper"]))
@@ -46,8 +49,6 @@ def main() -> None:
             rms = math.sqrt(sum(x * x for x in ratios) / len(ratios))
             worst = max(ratios, key=abs)
             print(f"rms log ratio {rms:.3f}, worst cell {100 * (math.exp(worst) - 1):+.1f} %")
-        name = f"baseline_{who}" + "_quiet" * quiet
-        write_rows(name, [{**r, **provenance()} for r in rows])
 
 
 if __name__ == "__main__":

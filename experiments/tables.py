@@ -176,7 +176,8 @@ def _short(error: float) -> str:
 def _beside_classical(cells: dict[tuple[str, str], dict[str, str]], world: str) -> list[str]:
     """How agents compare, cell by cell, with the best of the controllers without learning."""
     best: dict[tuple[str, str, str], float] = {}
-    for who in LEARNS_NOTHING:
+    names = ("extrapolate", "fir") if world else LEARNS_NOTHING
+    for who in names:
         for row in read(f"baseline_{who}{world}"):
             for unit in ("pos_mm", "ang_mrad"):
                 cell = row["delay"], row["sea"], unit
@@ -190,8 +191,8 @@ def _beside_classical(cells: dict[tuple[str, str], dict[str, str]], world: str) 
             f"{what} {min(shares.values()):.2f} to {shares[worst]:.2f} of its error "
             f"({' '.join(worst)}), at most a third in {third} of {len(shares)} cells"
         )
-    names = ", ".join(f"`{who}`" for who in LEARNS_NOTHING)
-    return [f"Beside the best of {names} in each cell: {'; '.join(said)}."]
+    rivals = ", ".join(f"`{who}`" for who in names)
+    return [f"Beside the best of {rivals} in each cell: {'; '.join(said)}."]
 
 
 def _over_seeds_line(name: str) -> list[str]:
