@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probe_envs import make_probe
+from flax import struct
+from probe_envs import ProbeEnv, make_probe
 
 from mcx_jax.config import FirstOrderConfig, TrainConfig, preset_config
 from mcx_jax.env_config import EnvConfig
@@ -51,22 +52,62 @@ def test_learns_to_remember_what_it_saw_first(training):
     assert errors[-1] < 0.1, errors[-1]
 
 
-def test_gradient_equals_a_central_difference(training):
-    env, state = training.env, training.start()
+def loss_and_gradient(env, state):
+    """params -> (loss of a window, its gradient), and params away from the kink of |action[1]| at
+    0, where a new policy begins."""
 
     def window(params):
         return trainer.window_gradient(params, CONFIG, env, state.obs_stats, state.actors)[:2]
 
-    # Away from the kink of |action[1]| at 0, where a new policy begins.
-    params = jax.tree.map(lambda p: p + 0.1, state.learner.policy.params)
-    window = jax.jit(window)
+    return jax.jit(window), jax.tree.map(lambda p: p + 0.1, state.learner.policy.params)
+
+
+def dot(a, b) -> float:
+    return float(
+        sum(jnp.vdot(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+    )
+
+
+def slope_along(direction, window, params) -> float:
+    """Central difference of the loss along a direction, per unit of length."""
+    size = 1e-2 / dot(direction, direction) ** 0.5
+    ends = [jax.tree.map(lambda p, d, s=s: p + s * d, params, direction) for s in (size, -size)]
+    return float((window(ends[0])[0] - window(ends[1])[0]) / 2e-2)
+
+
+def test_gradient_equals_a_central_difference(training):
+    window, params = loss_and_gradient(training.env, training.start())
     _, grads = window(params)
-    norm = jnp.sqrt(sum(jnp.vdot(g, g) for g in jax.tree.leaves(grads)))
-    size = 1e-2  # along the unit gradient, where the slope is the gradient's norm
-    moved = [jax.tree.map(lambda p, g, s=s: p + s * g / norm, params, grads) for s in (size, -size)]
-    slope = (window(moved[0])[0] - window(moved[1])[0]) / (2 * size)
-    # float32 rounding of the loss (6e-8 / 2e-2 = 3e-6) and the third derivative times size^2.
-    np.testing.assert_allclose(slope, norm, rtol=1e-2)
+    # Along the gradient the slope is its norm. float32 rounding of the loss (6e-8 / 2e-2 = 3e-6)
+    # and the third derivative times 1e-2 squared.
+    want = dot(grads, grads) ** 0.5
+    np.testing.assert_allclose(slope_along(grads, window, params), want, rtol=1e-2)
+
+
+@struct.dataclass
+class EchoEnv(ProbeEnv):
+    """A probe whose next observation is shifted by the action."""
+
+    integrator: str = struct.field(pytree_node=False, default="")
+
+    def step(self, state, action):
+        after = super().step(state, action)
+        return after.replace(obs=after.obs.at[0].add(action[0]))
+
+
+def test_the_gradient_through_what_is_seen_is_whole_where_servos_do_not_chatter(training):
+    fields = {name: getattr(training.env, name) for name in ProbeEnv.__dataclass_fields__}
+    state, grads = training.start(), {}
+    for integrator in ("quiet-smooth", "euler-smooth"):
+        window, params = loss_and_gradient(EchoEnv(**fields, integrator=integrator), state)
+        grads[integrator] = window(params)[1]
+    whole = grads["quiet-smooth"]
+    left_out = jax.tree.map(jnp.subtract, whole, grads["euler-smooth"])
+    length = dot(left_out, left_out) ** 0.5
+    assert length > 1e-2
+    # Along what the other one leaves out, by which its slope would be too small.
+    slope = slope_along(left_out, window, params)
+    assert abs(slope - dot(whole, left_out) / length) < 0.1 * length
 
 
 def test_relative_loss_by_hand(training):

@@ -35,6 +35,24 @@ def test_the_fusion_flag_goes_by_version(version, current, want):
     assert xla_flags_for(version, current) == current
 
 
+def test_threads_share_two_heaps_unless_the_user_has_said(monkeypatch):
+    class Library:
+        def __init__(self, calls):
+            self.mallopt = lambda *words: calls.append(words)
+
+    for user, want in ((None, [(startup.M_ARENA_MAX, 2)]), ("8", [])):
+        monkeypatch.delenv("MALLOC_ARENA_MAX", raising=False)
+        if user:
+            monkeypatch.setenv("MALLOC_ARENA_MAX", user)
+        calls = []
+        monkeypatch.setattr(startup.ctypes, "CDLL", lambda _, calls=calls: Library(calls))
+        startup.limit_heaps()
+        assert calls == want
+    monkeypatch.delenv("MALLOC_ARENA_MAX")
+    monkeypatch.setattr(startup.ctypes, "CDLL", lambda _: object())  # not glibc
+    startup.limit_heaps()
+
+
 def test_a_device_per_core_unless_the_user_has_set_it():
     want = f"{DEVICES_FLAG}=4 {PASSES_FLAG}={SPLIT_PASS}"
     assert xla_flags_for("0.10.2", "", cores=4) == want

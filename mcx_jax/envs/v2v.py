@@ -277,11 +277,9 @@ class V2VEnv:
             from mcx_jax.envs import mjx_engine
 
             base_at = lambda i: vessels.base_state(seg_a, i, self.wall)  # noqa: E731
-            integrator = self.integrator.removesuffix(chain.SMOOTH)  # MJX has its own derivative
-            state = arm.q, arm.qd
-            q, qd = mjx_engine.substeps(
-                self.mjx_model, *state, ctrl, base_at, count, integrator=integrator
-            )
+            state = arm.q, arm.qd, ctrl
+            named = {"integrator": self.integrator}
+            q, qd = mjx_engine.substeps(self.mjx_model, *state, base_at, count, **named)
         return ArmState(q=q, qd=qd)
 
 
