@@ -27,6 +27,7 @@ def main() -> None:
     names = [word for word in sys.argv[1:] if word != "--quiet"] or ["ik"]
     if unknown := set(names) - set(WHO):
         raise SystemExit(f"unknown controller {unknown}: use {', '.join(WHO)}")
+    origin = provenance()  # of what runs, whatever is committed meanwhile
     for who in names:
         file = f"baseline_{who}" + "_quiet" * quiet
         rows: list[dict] = []
@@ -37,7 +38,7 @@ def main() -> None:
             controller = fit_if_needed(who, load_controller(who)[1], env, motion, "")
             found = evaluate(who, controller, env, motion)
             seconds = time.monotonic() - begun
-            rows += [{**row, **provenance()} for row in evaluation_rows(found, seconds)]
+            rows += [{**row, **origin} for row in evaluation_rows(found, seconds)]
             write_rows(file, rows + kept(file, "delay", [row["delay"] for row in rows]))
             print(f"{who} {delay}: {seconds:.0f} s", flush=True)
         if who == "ik" and not quiet:

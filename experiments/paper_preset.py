@@ -7,25 +7,26 @@ All of it is 2500 iterations of 8 x 1000 steps, 80 updates of the policy and 80 
 days on a CPU. Writes experiments/paper_preset.csv: what the run has printed so far.
 """
 
-import json
 import sys
 from pathlib import Path
 
 from record import provenance, write_rows
 
-from mcx_jax.run_dir import METRICS
+from mcx_jax.run_dir import METRICS, whole_rows
 
-KEPT = ("steps", "pos_error_mm", "ang_error_mrad", "reward", "sigma", "wall_s")
+KEPT = {
+    **{"iteration": "d", "steps": "d", "pos_error_mm": ".3f", "ang_error_mrad": ".3f"},
+    **{"reward": ".6f", "sigma": ".4f", "policy_steps": ".0f", "wall_s": ".0f"},
+}
 
 
 def main() -> None:
     origin = provenance()
-    lines = (Path(sys.argv[1]) / METRICS).read_text().splitlines()
     write_rows(
         "paper_preset",
         [
-            {"iteration": row["iteration"], **{key: f"{row[key]:.4g}" for key in KEPT}, **origin}
-            for row in map(json.loads, lines)
+            {name: f"{row[name]:{form}}" for name, form in KEPT.items()} | origin
+            for row in whole_rows(Path(sys.argv[1]) / METRICS)
         ],
     )
 

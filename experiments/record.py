@@ -21,7 +21,7 @@ def provenance() -> dict[str, str]:
 
     command = " ".join(["python", "experiments/" + Path(sys.argv[0]).name, *sys.argv[1:]])
     commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=FOLDER
+        ["git", "describe", "--always", "--dirty=+"], capture_output=True, text=True, cwd=FOLDER
     ).stdout.strip()
     device = f"{jax.devices()[0].platform}, {os.cpu_count()} cores"
     versions = {"jax": jax.__version__, "mujoco": mujoco.__version__}

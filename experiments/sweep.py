@@ -41,6 +41,8 @@ def trained(algo: str, delay: str, seeds: int, quiet: bool, options: list[str]) 
             command += ["--run-dir", str(run), "--algo", algo, "--delay", delay]
             command += ["--seed", str(first), "--seeds", str(seeds - first), *options]
             command += ["--integrator", "quiet"] * quiet
+        if begun and stored_config(run).env.integrator != ("quiet" if quiet else "model"):
+            raise SystemExit(f"{run}: of another integrator; move it away")
         if not begun or latest(run) != stored_config(run).iterations:
             print(" ".join(command), flush=True)
             subprocess.run(command, check=True)

@@ -8,6 +8,7 @@ Each block stands between `<!-- table:NAME -->` and `<!-- end -->`.
 import csv
 import math
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
@@ -58,6 +59,11 @@ def source(row: dict[str, str]) -> str:
     return f"`{row['command']}` (commit {row['commit']}, {row['device']}, jax {row['jax']})"
 
 
+def sources(rows: Iterable[dict[str, str]]) -> str:
+    """Every command that the rows come from, once."""
+    return "; ".join(dict.fromkeys(source(row) for row in rows))
+
+
 def markdown(header: list[str], rows: list[list[str]]) -> str:
     lines = ["| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
     return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
@@ -101,7 +107,7 @@ def baseline() -> str:
             ]
         rows.append(row)
     header = ["delay", *(f"{s} mm" for s in SEAS), *(f"{s} mrad" for s in SEAS)]
-    return markdown(header, rows) + "\n\nSource: " + source(next(iter(cells.values())))
+    return markdown(header, rows) + "\n\nSource: " + sources(cells.values())
 
 
 def controllers() -> str:
@@ -128,8 +134,7 @@ def controllers() -> str:
     agents = {r["sea"]: r for r in everyone if r["who"] == "preview"}
     paper = [f"{agents[s]['pos_mm_paper']} mm, {agents[s]['ang_mrad_paper']} mrad" for s in SEAS]
     rows.append(["paper's agents, 20 M steps", *paper])
-    commands = "; ".join({r["command"]: source(r) for r in everyone}.values())
-    return markdown(["B4_4", *SEAS], rows) + "\n\nSource: " + commands
+    return markdown(["B4_4", *SEAS], rows) + "\n\nSource: " + sources(everyone)
 
 
 def agents() -> str:
@@ -153,9 +158,8 @@ def agents() -> str:
             trained = f"{steps:.1f} M steps{each}, {minutes:.1f} min"
             rows.append([*row, trained, mine[0]["seeds"]])
         header = [what, *(f"{s} mm" for s in SEAS), *(f"{s} mrad" for s in SEAS)]
-        sources = {source(r): None for r in cells.values()}
         table = markdown([*header, "trained", "seeds"], rows)
-        blocks.append(table + "\n\nSource: " + "; ".join(sources))
+        blocks.append(table + "\n\nSource: " + sources(cells.values()))
         blocks += _over_seeds_line(name)
         if name == "first_order_implicitfast":
             continue
@@ -188,8 +192,8 @@ def _beside_classical(cells: dict[tuple[str, str], dict[str, str]], world: str) 
         worst = max(shares, key=lambda key: shares[key])
         third = sum(share <= 1 / 3 for share in shares.values())
         said.append(
-            f"{what} {min(shares.values()):.2f} to {shares[worst]:.2f} of its error "
-            f"({' '.join(worst)}), at most a third in {third} of {len(shares)} cells"
+            f"{what} {min(shares.values()):.2f} to {shares[worst]:.2f} (worst: {' '.join(worst)}) "
+            f"of that controller's error, at most a third in {third} of {len(shares)} cells"
         )
     rivals = ", ".join(f"`{who}`" for who in names)
     return [f"Beside the best of {rivals} in each cell: {'; '.join(said)}."]
@@ -269,7 +273,7 @@ def growth(rows: list[dict]) -> str:
 
 
 def long_run() -> str:
-    """Memory and compilations of a run of half an hour."""
+    """Memory and compilations of a long run."""
     stored = read("long_run")
     return growth(stored) + ". Source: " + source(stored[0])
 
@@ -286,8 +290,7 @@ def robust() -> str:
     ]
     table = markdown(["mm, mrad", *whos], rows)
     said = [f"`robust` is better in both errors than {_lead(cells, r)}." for r in RIVALS]
-    sources = dict.fromkeys(source(r) for r in stored)
-    return "\n\n".join([table, " ".join(said), "Source: " + "; ".join(sources)])
+    return "\n\n".join([table, " ".join(said), "Source: " + sources(stored)])
 
 
 RIVALS = (("extrapolate",), LEARNS_NOTHING)

@@ -29,7 +29,7 @@ import numpy as np
 from mcx_jax import hosts
 from mcx_jax.errors import UserError, reason
 
-FORMAT = 2
+FORMAT = 3
 KEEP = 2
 FOLDER = "checkpoints"
 MANIFEST = "manifest.json"

@@ -28,12 +28,13 @@ M_ARENA_MAX = -8
 
 
 def limit_heaps(count: int = 2) -> None:
-    """Let all threads share a few heaps, unless the user has set MALLOC_ARENA_MAX; glibc alone.
+    """Let all threads share a few heaps, unless the user has set their number; glibc alone.
 
     A heap for every thread is the default, and a checkpoint is written by dozens of them: the
     holes that they leave made a training run grow for twenty minutes.
     """
-    if "MALLOC_ARENA_MAX" not in os.environ:
+    tunables = os.environ.get("GLIBC_TUNABLES", "")
+    if "MALLOC_ARENA_MAX" not in os.environ and "arena_max" not in tunables:
         set_option = getattr(ctypes.CDLL(None), "mallopt", None)
         if set_option:
             set_option(M_ARENA_MAX, count)
@@ -73,7 +74,8 @@ def cache_dir() -> Path:
 def configure(
     device: str = "auto", *, mjx: bool = False, cores: int | None = None, distributed: str = ""
 ) -> list[str]:
-    """Set XLA flags, the compilation cache and matmul precision; call before any JAX computation.
+    """Set XLA flags, the compilation cache, matmul precision and, without a word, the number of
+    heaps (`limit_heaps`); call before any JAX computation.
 
     Args:
         device: "auto", "cpu" or "gpu".

@@ -130,7 +130,7 @@ def test_passive_forces(paper):
     np.testing.assert_array_equal(paper.jnt_stiffness, 0)
 
 
-def test_quiet_model_differs_where_it_says(paper):
+def test_ur10e_differs_where_it_says(paper):
     """`ur10e.xml` is the paper's file but for integrator, armature and wrist 3."""
     quiet = mujoco.MjModel.from_xml_path(str(asset_path("ur10e.xml")))
     assert quiet.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST

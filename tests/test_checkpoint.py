@@ -104,7 +104,7 @@ def test_of_an_old_format(found, tmp_path):
     (meta / "metadata").write_text(json.dumps({"format": found, "iteration": 2}))
     with pytest.raises(UserError) as error:
         checkpoint.restore(tmp_path, _state())
-    assert f"2: checkpoint of format {found}; this version reads 2; go on with the version" in (
+    assert f"2: checkpoint of format {found}; this version reads 3; go on with the version" in (
         str(error.value)
     )
     assert "\n" not in str(error.value)
@@ -113,7 +113,7 @@ def test_of_an_old_format(found, tmp_path):
 def test_of_a_new_format(tmp_path):
     checkpoint.save(tmp_path, 2, _state())
     (tmp_path / "checkpoints" / "2" / "manifest.json").write_text('{"format": 9}')
-    with pytest.raises(UserError, match="checkpoint of format 9; this version reads 2"):
+    with pytest.raises(UserError, match="checkpoint of format 9; this version reads 3"):
         checkpoint.restore(tmp_path, _state())
 
 

@@ -16,7 +16,7 @@ from mcx_jax.evaluate import EvaluateConfig, evaluate, print_table
 from mcx_jax.results import GROUPS
 from mcx_jax.roster import load_controller
 
-# 20 steps count after the first second; the quiet integrator, so that rounding stays rounding.
+# 20 steps count after the first second; implicitfast, so that rounding grows little.
 SHORT = EnvConfig(delay="E2", integrator="implicitfast", episode_steps=70)
 SEAS = MotionConfig(sea="all")
 EPISODES = 3

@@ -25,9 +25,9 @@ from mcx_jax.bench import __main__ as bench_command
 from mcx_jax.config import TrainConfig, preset_config
 from mcx_jax.delay import parse_delay
 from mcx_jax.env_config import EnvConfig, parse_range
+from mcx_jax.envs.arm import load_arm
 from mcx_jax.envs.goal_path import load_goal_path
-from mcx_jax.envs.model import ARMS, chain_model, load_mujoco
-from mcx_jax.envs.v2v import _check_arm
+from mcx_jax.envs.model import ARMS, load_mujoco
 from mcx_jax.errors import UserError
 from mcx_jax.play import __main__ as play_command
 from mcx_jax.policy import Policy, PolicyMeta, load_policy, npz_bytes
@@ -445,10 +445,7 @@ def changed_arms(draw):
 
 
 def take_arm(path: Path):
-    mj = load_mujoco(str(path))
-    model = chain_model(mj, "tool")
-    _check_arm(str(path), mj, model)
-    return model
+    return load_arm(str(path), "tool")[1]
 
 
 @cases(250)

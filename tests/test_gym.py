@@ -16,7 +16,7 @@ from mcx_jax.envs.v2v import make_env
 from mcx_jax.errors import UserError
 
 STEPS = 12
-# implicitfast is quiet: rounding is not amplified, as Euler's chatter would.
+# implicitfast chatters less: rounding is not amplified as much as by Euler.
 QUIET = {"delay": "E2", "sea": "Wd", "integrator": "implicitfast", "episode_steps": STEPS}
 MANY = 3
 SMALL = 0.03

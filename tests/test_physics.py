@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from mcx_jax.envs import chain, mjx_engine
 from mcx_jax.envs.arm import START_POSE_RAD
 from mcx_jax.envs.model import chain_model, load_mujoco
+from mcx_jax.envs.plant import Plant
 from mcx_jax.errors import UserError
 from mcx_jax.spatial import unpack
 
@@ -351,11 +352,38 @@ def test_a_saturated_servo_keeps_its_damping_under_quiet_alone():
         <velocity joint="a" kv="1000" forcerange="-56 56"/></actuator></mujoco>"""
     )
     zero, one, still = jnp.zeros(1), jnp.ones(1), ((0.0,) * 3,) * 3
-    for integrator, want in (("quiet", 0.112 / 3), ("implicitfast", 0.112)):
+    drawn = [Plant(jnp.float32(0.0), jnp.float32(1.0), jnp.float32(x)) for x in (0, 1)]
+    for integrator, plant, want in (
+        ("quiet", None, 0.112 / 3),
+        ("implicitfast", None, 0.112),
+        ("mixed", drawn[1], 0.112 / 3),
+        ("mixed", drawn[0], 0.112),
+    ):
         simulate = functools.partial(chain.substeps, chain_model(mj), integrator)
-        rate = simulate(zero, zero, one, lambda _: still, 1)[1]
+        rate = simulate(zero, zero, one, lambda _: still, 1, None, plant)[1]
         np.testing.assert_allclose(rate, want, rtol=1e-6)  # float32
     np.testing.assert_allclose(arms.c_step(mj, 0.0, 0.0, 1.0).qvel, 0.112, rtol=1e-12)
+
+
+def test_only_under_quiet_does_the_arm_forget_where_it_was():
+    """References that move 0.3 rad/s in steps of 20 ms, from two postures 0.1 mrad apart: what is
+    left of it after half a second. Servos at their limits that chatter keep or enlarge it."""
+    model, still = chain_model(load_mujoco("paper")), ((0.0,) * 3, (0.0,) * 3, (0.0, 0.0, 9.81))
+    start, rate = jnp.asarray(START_POSE_RAD), jnp.full(6, 0.3)
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def end(integrator, q):
+        def one_step(state, k):
+            ctrl = jnp.concatenate([start + 0.3 * 0.02 * (k // 10 + 1), rate])
+            return chain.substeps(model, integrator, *state, ctrl, lambda _: still, 1), None
+
+        return lax.scan(one_step, (q, rate), jnp.arange(250))[0][0]
+
+    left = {
+        name: float(jnp.abs(end(name, start + 1e-4) - end(name, start)).max())
+        for name in ("euler", "implicitfast", "quiet")
+    }
+    assert left["quiet"] < 1e-6 < 1e-4 < min(left["euler"], left["implicitfast"]), left
 
 
 def test_the_random_states_reach_the_limits_of_both_servos():

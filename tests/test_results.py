@@ -105,7 +105,8 @@ IDEAL = [
 ]
 OTHERS = [
     *({"arm": "ur10e"}, {"arm": "docs/seven.xml"}, {"tool_site": "gripper"}, {"goal": "circle"}),
-    *({"integrator": "implicitfast"}, {"integrator": "mixed"}, {"max_correction": 1.0}),
+    *({"integrator": name} for name in ("implicitfast", "quiet", "mixed")),
+    {"max_correction": 1.0},
 ]
 DISTURBED = ("noise_mm", "noise_mrad", "latency_steps", "payload_kg")
 

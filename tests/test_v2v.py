@@ -22,7 +22,7 @@ from mcx_jax.spatial import unpack, unpack_matrix
 
 STEPS = 12
 ROWS = 128
-# implicitfast is quiet: rounding is not amplified, as Euler's chatter would.
+# implicitfast chatters less: rounding is not amplified as much as by Euler.
 QUIET = EnvConfig(delay="E2", integrator="implicitfast", episode_steps=STEPS)
 ROUGH = MotionConfig(sea="Wd")
 # Poses of 1 m in float32 through a dozen operations.

@@ -86,9 +86,10 @@ def joint_accelerations(
 
     euler: M + h D with the joints' own damping D (without any, this is the forward dynamics).
     implicitfast: the actuators' velocity derivative as well, but for those at their force limit.
-    quiet: for these, too, as MuJoCo's implicitfast was until 3.4.0; 3.5.0 left them out, and the
-    velocity servo of this arm has chattered under implicitfast ever since: it is at its limit 0.06
-    rad/s off its command, and 56 N m on 1 kg m2 are twice that in one step of 2 ms.
+    quiet: for these, too, as MuJoCo's implicitfast was until 3.4.0; 3.5.0 left them out, and servos
+    have chattered under it ever since: wrist 3 of the arm `paper` is at its limit of 56 N m when
+    0.056 rad/s off its command, and 56 N m change the speed of its 1 kg m2 by 0.112 rad/s in one
+    step of 2 ms, past the command and to the other limit.
     mixed: euler or quiet, as the plant says.
 
     With the ending -smooth: the same values with the derivative of a quiet step whose servos have
@@ -126,7 +127,7 @@ def _accelerations(
     slopes = slopes if name == "implicitfast" else unlimited
     factors = factored(_damping(model, name, slopes, plant))
     value = tuple(stage(wall, solve, factors, rhs))
-    if name != integrator and name != "quiet":  # whose factors are these already
+    if name != integrator and name != "quiet":  # quiet's own factors are these already
         factors = factored(unlimited)
     return value, (value, factors, angles)
 
