@@ -278,6 +278,21 @@ def long_run() -> str:
     return growth(stored) + ". Source: " + source(stored[0])
 
 
+def paper_preset() -> str:
+    """What the paper's own schedule has done so far."""
+    rows = read("paper_preset")
+    first, last = rows[0], rows[-1]
+    said = [
+        f"{what} {float(first[name]):.{digits}f} at first, {float(last[name]):.{digits}f} at last"
+        for what, name, digits in (
+            ("position error, exploration included, mm", "pos_error_mm", 1),
+            ("orientation error, mrad", "ang_error_mrad", 1),
+            ("standard deviation of the exploration, cm and crad", "sigma", 3),
+        )
+    ]
+    return f"{last['iteration']} iterations; {'; '.join(said)}. Source: {sources(rows)}"
+
+
 def robust() -> str:
     """Where the task is hard: controllers side by side."""
     stored = read("robust")
@@ -430,6 +445,7 @@ TABLES = {
     "scaling": scaling,
     "observation": observation,
     "presets": presets,
+    "paper_preset": paper_preset,
 }
 
 
