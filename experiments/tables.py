@@ -70,7 +70,7 @@ def markdown(header: list[str], rows: list[list[str]]) -> str:
 
 
 def headline() -> str:
-    """The three numbers of the first screen."""
+    """The numbers of the first screen."""
     rows = []
     cells = read("baseline_ik")
     names = ("pos_mm", "ang_mrad")
@@ -80,7 +80,11 @@ def headline() -> str:
     value = f"rms log ratio {rms:.3f}, worst cell {worst:+.0f} %"
     what = "IK baseline against table 3's implied one, 40 cells"
     rows.append([what, value, f"`{cells[0]['command']}`"])
-    for name, label in (("ppo", "PPO"), ("first_order", "gradient through the simulator")):
+    for name, label in (
+        ("ppo", "PPO"),
+        ("first_order", "gradient through the simulator"),
+        ("first_order_quiet", "the same where servos do not chatter"),
+    ):
         stored = [r for r in over_seeds(name) if r["delay"] == "B4_4"]
         found = {(r["who"] == "ik", r["sea"]): r for r in stored}
         gains = [
@@ -89,9 +93,13 @@ def headline() -> str:
         ]
         one = found[False, "Wa"]
         what = f"{label}, delay B4_4, {int(one['steps']) / 1e6:.1f} M control steps"
-        value = f"position error {min(gains):.0f} to {max(gains):.0f} % below the baseline's"
+        value = f"position error {_gain(min(gains))} to {_gain(max(gains))} % below the baseline's"
         rows.append([what, value, f"`{one['command']}`"])
     return markdown(["what", "here", "command"], rows)
+
+
+def _gain(percent: float) -> str:
+    return f"{percent:.0f}" if percent < 99 else f"{percent:.1f}"
 
 
 def baseline() -> str:
