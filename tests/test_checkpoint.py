@@ -110,10 +110,11 @@ def test_of_an_old_format(found, tmp_path):
     assert "\n" not in str(error.value)
 
 
-def test_of_a_new_format(tmp_path):
+@pytest.mark.parametrize("found", [2, 9])
+def test_of_another_format_with_a_manifest(found, tmp_path):
     checkpoint.save(tmp_path, 2, _state())
-    (tmp_path / "checkpoints" / "2" / "manifest.json").write_text('{"format": 9}')
-    with pytest.raises(UserError, match="checkpoint of format 9; this version reads 3"):
+    (tmp_path / "checkpoints" / "2" / "manifest.json").write_text(f'{{"format": {found}}}')
+    with pytest.raises(UserError, match=f"checkpoint of format {found}; this version reads 3"):
         checkpoint.restore(tmp_path, _state())
 
 

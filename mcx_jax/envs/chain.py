@@ -117,19 +117,26 @@ def _accelerations(
     bias = stage(wall, partial(bias_forces, model), angles, qd, base)
     matrix = stage(wall, partial(mass_matrix, model), angles)
     torque, slopes = actuate(model, q, qd, ctrl)
-    unlimited = actuate(model, q, qd, ctrl, limited=False)[1]
     rhs = [sub(t, b) for t, b in zip(torque, bias, strict=True)]
 
     def factored(damping):
         return stage(wall, factor, _stiffened(matrix, damping, model.timestep_s))
 
     name = integrator.removesuffix(SMOOTH)
-    slopes = slopes if name == "implicitfast" else unlimited
+    slopes = slopes if name == "implicitfast" else _full_damping(model)
     factors = factored(_damping(model, name, slopes, plant))
     value = tuple(stage(wall, solve, factors, rhs))
     if name != integrator and name != "quiet":  # quiet's own factors are these already
-        factors = factored(unlimited)
+        factors = factored(_full_damping(model))
     return value, (value, factors, angles)
+
+
+def _full_damping(model: ChainModel) -> list[Scalar]:
+    """Dampers' and actuators' damping of each joint with no actuator at its limit, N m s/rad."""
+    damping: list[Scalar] = [link.damping for link in model.links]
+    for act in model.actuators:
+        damping[act.joint] = add(damping[act.joint], -act.bias[2] * act.gear**2)
+    return damping
 
 
 def _damping(model: ChainModel, integrator: str, slopes: list[Scalar], plant: Plant | None):

@@ -5,6 +5,7 @@ Pure, jittable, vmappable, differentiable. `vmap` it with the batch axis last
 """
 
 from dataclasses import replace
+from functools import partial
 from typing import Literal
 
 import jax
@@ -277,9 +278,8 @@ class V2VEnv:
             from mcx_jax.envs import mjx_engine
 
             base_at = lambda i: vessels.base_state(seg_a, i, self.wall)  # noqa: E731
-            state = arm.q, arm.qd, ctrl
-            named = {"integrator": self.integrator}
-            q, qd = mjx_engine.substeps(self.mjx_model, *state, base_at, count, **named)
+            advance = partial(mjx_engine.substeps, self.mjx_model, integrator=self.integrator)
+            q, qd = advance(arm.q, arm.qd, ctrl, base_at, count)
         return ArmState(q=q, qd=qd)
 
 
