@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from mcx_jax.controllers import IK, Extrapolate, Preview
 from mcx_jax.delay import CONTROL_DT_S, PHYSICS_DT_S, SUBSTEPS
 from mcx_jax.env_config import EnvConfig, MotionConfig
-from mcx_jax.envs import chain, ik, lag, observe, vessels
+from mcx_jax.envs import chain, ik, lag, observe, servo, vessels
 from mcx_jax.envs.model import load_mujoco
 from mcx_jax.envs.motion import LOOK_AHEAD_STEPS, draw_track, load_motion
-from mcx_jax.envs.v2v import MAX_ERROR_M, SETTLE_STEPS, command, correct, make_env
+from mcx_jax.envs.v2v import MAX_ERROR_M, SETTLE_STEPS, correct, make_env
 from mcx_jax.errors import UserError
 from mcx_jax.sea.sampler import KNOT_STEPS
 from mcx_jax.spatial import unpack, unpack_matrix
@@ -271,14 +271,6 @@ def test_correct_by_hand():
     np.testing.assert_allclose(np.array(got_r), want, rtol=0, atol=1e-7)
 
 
-def test_command_order_is_the_models(env):
-    reference, rate = jnp.arange(6.0), 10.0 + jnp.arange(6.0)
-    # The MJCF lists six position servos, then six velocity servos.
-    np.testing.assert_array_equal(
-        command(env.model, reference, rate), [0, 1, 2, 3, 4, 5, 10, 11, 12, 13, 14, 15]
-    )
-
-
 def test_the_velocity_reference_is_zero_at_the_first_step(env, step, first):
     zero = jnp.zeros(6)
     shifted = first.replace(reference=first.reference + 0.05)
@@ -309,7 +301,7 @@ def test_order_of_a_control_step_with_two_steps_of_delay(env, episode):
             env.integrator,
             before.arm.q,
             before.arm.qd,
-            command(env.model, found.q, rate),
+            servo.commands(env.model, found.q, rate),
             lambda k: vessels.base_state(seg, k),
             SUBSTEPS,
         )

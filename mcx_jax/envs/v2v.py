@@ -15,7 +15,7 @@ from flax import struct
 from mcx_jax.batch_last import batch_last
 from mcx_jax.delay import CONTROL_DT_S, SUBSTEPS, Delay
 from mcx_jax.env_config import EnvConfig, MotionConfig
-from mcx_jax.envs import chain, conditions, ik, lag, observe, vessels
+from mcx_jax.envs import chain, conditions, ik, lag, observe, servo, vessels
 from mcx_jax.envs.arm import load_arm, start_pose
 from mcx_jax.envs.conditions import Conditions, Measurement
 from mcx_jax.envs.goal_path import GoalPath, load_goal_path
@@ -202,7 +202,7 @@ class V2VEnv:
     def joint_torques(self, before: EnvState, after: EnvState) -> jax.Array:
         """(nq,) torques of the servos at the end of the control step between two states, N m."""
         rate = _rate(before, after.reference)
-        ctrl = command(self.model, after.reference, rate)
+        ctrl = servo.commands(self.model, after.reference, rate)
         angles, rates = unpack(after.arm.q, self.model.nq), unpack(after.arm.qd, self.model.nq)
         commands = unpack(ctrl, len(self.model.actuators))
         return jnp.stack(chain.actuate(self.model, angles, rates, commands)[0])
@@ -264,7 +264,7 @@ class V2VEnv:
         drawn: Conditions,
     ) -> ArmState:
         """The engine behind one function: physics steps of 2 ms with the references held."""
-        ctrl = command(self.model, reference, rate)
+        ctrl = servo.commands(self.model, reference, rate)
         # The engines advance a base at physics step i by the deck's motion at that instant.
         if self.mjx_model is None:
 
@@ -299,11 +299,6 @@ def correct(goal: tuple[Mat, Vec], action: jax.Array) -> tuple[Mat, Vec]:
     shift = vscale(ACTION_SCALE, (a[0], a[1], a[2]))
     turn = vscale(ACTION_SCALE, (a[3], a[4], a[5]))
     return matmul(goal[0], exp_rotation(turn)), vadd(goal[1], matvec(goal[0], shift))
-
-
-def command(model: ChainModel, reference: jax.Array, rate: jax.Array) -> jax.Array:
-    """(nu,) actuator commands: position servos get the reference, velocity servos its rate."""
-    return jnp.stack([(reference if act.bias[1] else rate)[act.joint] for act in model.actuators])
 
 
 def _valid(found: ik.IKResult, arm: ArmState, pos_error_m: jax.Array) -> jax.Array:
