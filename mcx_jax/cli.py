@@ -181,9 +181,11 @@ def config_from_json(config_type: type[Config], text: str, where: str = "config.
 
 def _build(config_type: type[Config], values: Any, where: str) -> Config:
     hints = get_type_hints(config_type)
-    names = [f.name for f in dataclasses.fields(config_type)]  # type: ignore[arg-type]
+    settings = dataclasses.fields(config_type)  # type: ignore[arg-type]
+    names = [f.name for f in settings]
     if not isinstance(values, dict):
         raise UserError(f"{where}: must hold settings, not {values!r}")
+    values = {f.name: f.default for f in settings if "added" in f.metadata} | values
     unknown = sorted(set(values) - set(names))
     missing = [name for name in names if name not in values]
     if unknown or missing:

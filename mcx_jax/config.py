@@ -11,6 +11,9 @@ from typing import Literal
 from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.errors import UserError, require
 
+ADDED = {"added": True}
+"""Metadata of a setting that files written before it lack; its default is what they did."""
+
 MAX_SHARDS = 64
 """Most groups of environments (`TrainConfig.shards`), and so most devices that share one run."""
 MAX_SEED = 2**31 - 1
@@ -156,6 +159,8 @@ class TrainConfig:
     """Environments stepped in parallel."""
     total_steps: int = 20_000_000
     """Control steps of training, summed over the environments (paper: 20 M)."""
+    start_from: str = field(default="", metadata=ADDED)
+    """Begin with a trained policy's weights: of a run directory, a policy .npz, shipped:DELAY."""
     seed: int = 0
     """Random seed."""
     seeds: int = 1

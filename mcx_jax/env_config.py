@@ -6,6 +6,9 @@ from typing import Literal
 from mcx_jax.delay import Delay, parse_delay
 from mcx_jax.errors import UserError, require
 
+COUPLED = "-coupled"
+"""Ending of a sea's name: both vessels in one wave field."""
+
 
 @dataclass(frozen=True)
 class Range:
@@ -39,7 +42,7 @@ def parse_range(flag: str, text: str, limit: float, whole: bool = False) -> Rang
 @dataclass(frozen=True)
 class ConditionsConfig:
     """What is not as it should be: a number, or LOW:HIGH for one drawn in each episode, uniformly
-    (the factor of the inertia: uniformly in its logarithm)."""
+    (noise: uniformly in its root; the factor of the inertia: in its logarithm)."""
 
     noise_mm: str = "0"
     """White noise of the goal's measured position, standard deviation of each axis, mm."""
@@ -146,7 +149,8 @@ class MotionConfig:
 
     sea: str = "all"
     """Sea: all (Wa..Wd, one drawn per episode), one of Wa Wb Wc Wd, or Hs:Tp full scale (m:s).
-    Several with commas between them: one drawn per episode."""
+    Several with commas between them: one drawn per episode. Ending in -coupled (Wa-coupled): both
+    vessels in one wave field in that sea."""
     motion: str = ""
     """Recorded motion instead of the generator: .npy or .csv, columns t,x,y,z,roll,pitch,yaw."""
     motion_length_unit: Literal["m", "mm"] = "m"
@@ -156,9 +160,13 @@ class MotionConfig:
     motion_scale: float = 1.0
     """Froude scale of --motion: lengths are divided by it, time by its root (already scaled: 1)."""
     coupled: bool = False
-    """Both vessels in one wave field instead of independent windows (the paper: independent)."""
+    """Both vessels in one wave field in every sea (the paper: independent windows)."""
     split: Literal["seeds", "paper"] = "seeds"
     """Test motion: another wave seed (seeds), or the last third of the same hour (paper)."""
+
+    def is_coupled(self, sea: str) -> bool:
+        """Whether both vessels are in one wave field in this one of the seas."""
+        return self.coupled or sea.endswith(COUPLED)
 
     def __post_init__(self) -> None:
         require(self.motion_scale > 0, f"--motion-scale {self.motion_scale}: must be positive")

@@ -5,7 +5,7 @@ import functools
 from dataclasses import replace
 
 from mcx_jax.assets import asset_path
-from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
+from mcx_jax.env_config import COUPLED, ConditionsConfig, EnvConfig, MotionConfig
 
 
 @functools.cache
@@ -39,4 +39,5 @@ def is_papers_world(env: EnvConfig, motion: MotionConfig) -> bool:
     )
     ideal = env.conditions.ranges == ConditionsConfig().ranges  # however it is written
     moved = replace(motion, sea=MotionConfig.sea, split=MotionConfig.split)
-    return ideal and same == EnvConfig() and moved == MotionConfig()
+    apart = COUPLED not in motion.sea
+    return apart and ideal and same == EnvConfig() and moved == MotionConfig()

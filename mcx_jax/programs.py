@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,9 @@ from mcx_jax.config import TrainConfig
 from mcx_jax.envs.v2v import V2VEnv
 from mcx_jax.ppo.rollout import layout, reset_all
 from mcx_jax.sharding import env_mesh, put, shardings
+
+if TYPE_CHECKING:
+    from mcx_jax.policy import Policy
 
 RESET_STREAM = 1
 """Folded into a run's key for its resets; the rest of its random numbers come from another."""
@@ -67,10 +70,20 @@ class Training:
     _init: Callable[..., Any]
     _iterate: Callable[..., Any]
 
-    def start(self) -> Any:
-        """The state of a new run."""
+    def start(self, policy: "Policy | None" = None) -> Any:
+        """The state of a new run.
+
+        Args:
+            policy: begin with its weights and statistics, in every seed; None = with new ones.
+        """
         blocks = [self._fresh(number) for number in range(self.config.reset_groups)]
-        return self._init(self.env, self.seeds, blocks)
+        state = self._init(self.env, self.seeds, blocks)
+        if policy is None:
+            return state
+        old = state.learner.policy.params, state.obs_stats
+        params, stats = jax.tree.map(_like, (policy.params, policy.obs_stats), old)
+        fitted = replace(state.learner.policy, params=params)
+        return replace(state, learner=replace(state.learner, policy=fitted), obs_stats=stats)
 
     def iterate(self, state: Any, iteration: int) -> tuple[Any, Any]:
         """(state, metrics) after one more iteration; consumes the old state.
@@ -118,6 +131,11 @@ def prepare(config: TrainConfig, env: Any, mesh: Mesh | None = None) -> Training
         jitted = jax.jit(iterates, donate_argnums=1, out_shardings=(placed, None))
         iterating = jitted.lower(env, like, fresh).compile()
         return Training(config, env, seeds, like, resetting.result(), starting.result(), iterating)
+
+
+def _like(new: Any, old: jax.Array) -> jax.Array:
+    """`new`, once for each seed, placed as `old` is."""
+    return jax.device_put(jnp.broadcast_to(jnp.asarray(new, old.dtype), old.shape), old.sharding)
 
 
 def _with_sharding(tree: Any, placed: Any) -> Any:

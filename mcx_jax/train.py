@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from mcx_jax import cli, hosts, machine, tensorboard
+from mcx_jax.assets import policy_file
 from mcx_jax.config import TrainConfig, preset_config
 from mcx_jax.errors import UserError
 from mcx_jax.run_dir import (
@@ -102,6 +103,14 @@ def _refuse_unused(asked: TrainConfig, defaults: TrainConfig) -> None:
             raise UserError(f"{flag} has no meaning with --algo {asked.algo}; leave it out")
 
 
+def _refuse_no_policy(start_from: str) -> None:
+    if start_from and not os.path.isfile(policy_file(start_from)):
+        raise UserError(
+            f"--start-from {start_from}: no policy there; name a run directory, a policy .npz or "
+            "shipped:DELAY"
+        )
+
+
 def read_command(argv: list[str]) -> tuple[TrainCommand, RunDir]:
     """The command and its checked directory; nothing is written.
 
@@ -117,6 +126,7 @@ def read_command(argv: list[str]) -> tuple[TrainCommand, RunDir]:
     command = parse(default=TrainCommand(train=defaults))
     if not command.resume and not command.resume_from:
         _refuse_unused(command.train, defaults)
+        _refuse_no_policy(command.train.start_from)
         return command, open_new(_directory(command), command.train)
     path = Path(command.run_dir) if command.run_dir else default_path(command.train)
     command = parse(default=TrainCommand(train=stored_config(path)))

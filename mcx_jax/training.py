@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from mcx_jax import checkpoint, cli, hosts, tensorboard
 from mcx_jax.config import TrainConfig
+from mcx_jax.errors import UserError
 from mcx_jax.progress import Progress, short_time
 from mcx_jax.run_dir import POLICY, RunDir, writing
 from mcx_jax.stop import StopRequest
@@ -139,6 +140,30 @@ def iterate(
     return policy
 
 
+def first_policy(config: TrainConfig, env: Any) -> "Policy | None":
+    """The policy that a new run begins with, if it was asked for.
+
+    Raises:
+        UserError: it cannot be read, or is of another shape than this run's.
+    """
+    if not config.start_from:
+        return None
+    from mcx_jax.policy import load_run
+
+    policy = load_run(config.start_from)
+    meta, ppo = policy.meta, config.ppo
+    theirs = (meta.obs_size, meta.action_size, meta.hidden, meta.cell)
+    ours = (env.obs_size, env.action_size, ppo.hidden, ppo.cell)
+    words = ("observations", "actions", "--hidden units", "as its --cell")
+    for what, have, want in zip(words, theirs, ours, strict=True):
+        if have != want:
+            raise UserError(
+                f"--start-from {config.start_from}: that policy has {have} {what}, this run "
+                f"{want}; change this run's settings, or start from another policy"
+            )
+    return policy
+
+
 def train(
     run: RunDir,
     make_env: Callable[..., Any],
@@ -170,6 +195,7 @@ def _train(
     config = run.config
     begun = time.monotonic()
     env = make_env(config.env, config.motion, split="train")
+    first = None if run.start_iteration else first_policy(config, env)
     ready = time.monotonic()
     training = prepare(config, env)
     print(
@@ -180,7 +206,7 @@ def _train(
     if run.start_iteration:
         state = checkpoint.restore(run.path, training.like, run.start_iteration)
     else:
-        state = training.start()
+        state = training.start(first)
     run.create()
     hosts.agree(0)  # the others read what it has cut
     if run.start_iteration:

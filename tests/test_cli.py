@@ -116,6 +116,12 @@ def test_strange_configuration_files(change, message):
     assert str(error.value) == message
 
 
+def test_a_setting_added_later_has_its_default_in_older_files():
+    values = json.loads(cli.config_to_json(preset_config("fast")))
+    del values["start_from"]
+    assert cli.config_from_json(TrainConfig, json.dumps(values)) == preset_config("fast")
+
+
 def test_cut_short_configuration_file():
     text = cli.config_to_json(preset_config("fast"))
     with pytest.raises(UserError, match="config.json: not a JSON file, or cut short"):

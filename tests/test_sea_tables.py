@@ -131,7 +131,7 @@ def test_coupled_vessels_meet_the_same_long_wave():
     # pitch axes point backwards, while its x, y are given along the world axes.
     sea = SeaState(1.0, 20.0, "swell")
     own = build_tables([sea], "test")
-    both = build_tables([sea], "test", coupled=True)
+    both = build_tables([sea], "test", coupled=[True])
     np.testing.assert_array_equal(own.knots, both.knots)
     assert own.companion is None and both.companion is not None
     a, b = both.knots[0].T, both.companion[0].T
@@ -146,7 +146,7 @@ def test_coupled_vessel_upwave_moves_first(monkeypatch):
     monkeypatch.setattr(tables_module, "SEPARATION_X_M", 3.0)
     knobs = VesselKnobs(heading_deg=180.0, base_x_m=0.0)
     tables_module._responses.cache_clear()
-    both = build_tables([SEAS["Wb"]], "test", knobs, coupled=True)
+    both = build_tables([SEAS["Wb"]], "test", knobs, coupled=[True])
     tables_module._responses.cache_clear()
     assert both.companion is not None
     a, b = both.knots[0, :-1, 2], both.companion[0, :-1, 2]

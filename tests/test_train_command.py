@@ -26,7 +26,7 @@ from mcx_jax.progress import Progress, short_time
 from mcx_jax.run_dir import RunDir, default_path, open_existing, open_new
 from mcx_jax.stop import StopRequest
 from mcx_jax.train import compile_quickly, main, read_command
-from mcx_jax.training import train
+from mcx_jax.training import first_policy, train
 
 CONFIG = replace(
     preset_config("fast"),
@@ -113,6 +113,36 @@ def test_stopped_and_resumed_is_never_stopped(finished, tmp_path, monkeypatch, c
         file.write('{"iteration": 3, "wall_s": 0.0}\n{"iterat')
     train(open_existing(path, CONFIG), _make_env)
     _assert_same_run(path, finished, CONFIG)
+
+
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_start_from_a_policy(finished, tmp_path, seeds):
+    """Its weights and statistics in every seed; the rest of the state is a new run's."""
+    config = replace(CONFIG, start_from=str(finished), seeds=seeds)
+    begun = load_policy(finished / "policy.npz")
+    training = prepare(config, make_probe(scale=0.01))
+    state, new = training.start(first_policy(config, training.env)), training.start()
+    got = state.learner.policy.params, state.obs_stats
+    for x, y in zip(
+        jax.tree.leaves(got), jax.tree.leaves((begun.params, begun.obs_stats)), strict=True
+    ):
+        np.testing.assert_array_equal(x, np.broadcast_to(y, x.shape))
+    value = state.learner.value.params, new.learner.value.params
+    for x, y in zip(jax.tree.leaves(value[0]), jax.tree.leaves(value[1]), strict=True):
+        np.testing.assert_array_equal(x, y)
+    train(open_new(tmp_path / "run", config), _make_env)
+    stored = json.loads((tmp_path / "run" / "config.json").read_text())
+    assert stored["start_from"] == str(finished)
+
+
+def test_start_from_a_policy_of_another_shape(finished, tmp_path):
+    config = replace(CONFIG, start_from=str(finished), ppo=replace(CONFIG.ppo, hidden=16))
+    with pytest.raises(UserError) as error:
+        train(open_new(tmp_path / "run", config), _make_env)
+    assert str(error.value) == (
+        f"--start-from {finished}: that policy has 8 --hidden units, this run 16; "
+        "change this run's settings, or start from another policy"
+    )
 
 
 def test_killed_before_the_first_checkpoint_starts_again(finished, tmp_path):
@@ -273,6 +303,11 @@ def test_strange_directories(tmp_path, capsys):
         ("--device tpu", "--device tpu: use one of auto, cpu, gpu"),
         ("--resum", "unknown option --resum: did you mean --resume? --help lists all"),
         ("--num-envs 2.5", "--num-envs 2.5: must be a whole number"),
+        (
+            "--start-from ik",
+            "--start-from ik: no policy there; name a run directory, a policy .npz or "
+            "shipped:DELAY",
+        ),
         ("--resume-from -1", "--resume-from -1: must be 0 or a positive number"),
         (
             "--checkpoint-interval-s nan",

@@ -519,6 +519,20 @@ def test_coupled_vessels_share_one_window():
     assert 0.1 < np.corrcoef(a, b)[0, 1] < 0.999
 
 
+def test_coupled_seas_among_others():
+    """Only they share a window, and a wave field that vessel B meets later."""
+    mixed = load_motion(MotionConfig(sea="Wd,Wd-coupled"), 100, "test")
+    alone = load_motion(MotionConfig(sea="Wd", coupled=True), 100, "test")
+    assert mixed.seas == ("Wd", "Wd-coupled") and mixed.coupled == (False, True)
+    np.testing.assert_array_equal(mixed.knots_b[0], mixed.knots_a[0])
+    np.testing.assert_array_equal(mixed.knots_b[1], alone.knots_b[0])
+    np.testing.assert_array_equal(mixed.knots_a[1], alone.knots_a[0])
+    starts = [track(mixed, [sea, 0.2, 0.3, 0.9]) for sea in (0.1, 0.6)]
+    assert [int(t.table) for t in starts] == [0, 1]
+    assert [int(t.start_a) == int(t.start_b) for t in starts] == [False, True]
+    assert int(starts[0].start_a) == int(starts[1].start_a)
+
+
 def test_literal_sea_and_sea_of_all():
     literal = load_motion(MotionConfig(sea="1.5:8"), 100, "test")
     named = load_motion(MotionConfig(sea="all"), 100, "test")

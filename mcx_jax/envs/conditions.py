@@ -73,8 +73,8 @@ def draw(config: EnvConfig, key: jax.Array, path_steps: int) -> Conditions:
         )
     if asked.noisy:
         noise = Noise(
-            position_m=1e-3 * _between(ranges["noise_mm"], uniform[3]),
-            angle_rad=1e-3 * _between(ranges["noise_mrad"], uniform[4]),
+            position_m=1e-3 * _between_roots(ranges["noise_mm"], uniform[3]),
+            angle_rad=1e-3 * _between_roots(ranges["noise_mrad"], uniform[4]),
             key=key,
         )
     if ranges["latency_steps"].high > 0:
@@ -88,6 +88,13 @@ def draw(config: EnvConfig, key: jax.Array, path_steps: int) -> Conditions:
 
 def _between(bounds: Range, uniform: jax.Array) -> jax.Array:
     return bounds.low + (bounds.high - bounds.low) * uniform
+
+
+def _between_roots(bounds: Range, uniform: jax.Array) -> jax.Array:
+    """Uniform in the root: with 0 to 3 mm a third of the episodes has less than 0.3 mm. Drawn
+    evenly, hardly one is clean, and what learns from them never trusts a measurement."""
+    low, high = bounds.low**0.5, bounds.high**0.5
+    return (low + (high - low) * uniform) ** 2
 
 
 def _between_logs(bounds: Range, uniform: jax.Array) -> jax.Array:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from mcx_jax.delay import CONTROL_DT_S, SUBSTEPS
-from mcx_jax.env_config import MotionConfig
+from mcx_jax.env_config import COUPLED, MotionConfig
 from mcx_jax.errors import UserError
 from mcx_jax.sea.sampler import KNOT_STEPS
 
@@ -23,15 +23,15 @@ class Motion:
     knots_a: jax.Array
     """(tables, knots + 1, 12): x y z m, roll pitch yaw rad, their rates; one knot each 0.1 s."""
     knots_b: jax.Array
-    """The same for vessel B; the same array unless the vessels share one wave field."""
+    """The same for vessel B; the same array unless they share one wave field in some sea."""
     seas: tuple[str, ...] = struct.field(pytree_node=False)
     """Name of each sea; tables are ordered [sea, seed]."""
     seeds: int = struct.field(pytree_node=False)
     """Tables per sea."""
     last_start: int = struct.field(pytree_node=False)
     """Latest window start, control steps of 20 ms (inclusive); the earliest is 0."""
-    coupled: bool = struct.field(pytree_node=False, default=False)
-    """Both vessels use the same window (one wave field)."""
+    coupled: tuple[bool, ...] = struct.field(pytree_node=False)
+    """Of each sea: both vessels use the same window (one wave field)."""
 
 
 @struct.dataclass
@@ -59,7 +59,9 @@ def draw_track(motion: Motion, uniform: jax.Array, sea: jax.Array | int | None =
     seed = _pick(uniform[1], motion.seeds)
     starts = motion.last_start + 1
     start_a = SUBSTEPS * _pick(uniform[2], starts)
-    start_b = start_a if motion.coupled else SUBSTEPS * _pick(uniform[3], starts)
+    start_b = SUBSTEPS * _pick(uniform[3], starts)
+    if any(motion.coupled):
+        start_b = jnp.where(jnp.asarray(motion.coupled)[sea], start_a, start_b)
     table = jnp.asarray(sea * motion.seeds + seed, jnp.int32)
     return Track(table=table, start_a=start_a, start_b=start_b)
 
@@ -79,9 +81,9 @@ def load_motion(
     """
     needed_steps = episode_steps + LOOK_AHEAD_STEPS
     if config.motion:
-        names, knots_a, knots_b = _recorded(config, split)
+        names, knots_a, knots_b, coupled = _recorded(config, split)
     else:
-        names, knots_a, knots_b = _generated(config, split)
+        names, knots_a, knots_b, coupled = _generated(config, split)
     last_start = (knots_a.shape[1] - 1) * KNOT_STEPS // SUBSTEPS - needed_steps - 1
     if last_start < 0:
         raise UserError(
@@ -95,7 +97,7 @@ def load_motion(
         seas=names,
         seeds=knots_a.shape[0] // len(names),
         last_start=last_start,
-        coupled=config.coupled,
+        coupled=coupled,
     )
 
 
@@ -104,9 +106,10 @@ def _generated(config: MotionConfig, split: Literal["train", "test"]):
     from mcx_jax.sea.tables import build_tables
 
     names = NAMED_SEAS if config.sea == "all" else tuple(config.sea.split(","))
-    seas = [parse_sea(name) for name in names]
-    tables = build_tables(seas, split, coupled=config.coupled, split=config.split)
-    return tables.sea_names, tables.knots, tables.companion
+    seas = [parse_sea(name.removesuffix(COUPLED)) for name in names]
+    coupled = tuple(config.is_coupled(name) for name in names)
+    tables = build_tables(seas, split, coupled=coupled, split=config.split)
+    return names, tables.knots, tables.companion, coupled
 
 
 def _recorded(config: MotionConfig, split: Literal["train", "test"]):
@@ -119,4 +122,4 @@ def _recorded(config: MotionConfig, split: Literal["train", "test"]):
         scale=config.motion_scale,
     )
     train, test = split_recording(tables)
-    return ("motion",), (train if split == "train" else test).knots, None
+    return ("motion",), (train if split == "train" else test).knots, None, (False,)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mcx_jax.env_config import MotionConfig
+from mcx_jax.env_config import COUPLED, MotionConfig
 from mcx_jax.play.episode import Take
 from mcx_jax.sea.hydro import VesselKnobs
 from mcx_jax.sea.spectrum import GRAVITY_M_S2, parse_sea
@@ -81,11 +81,12 @@ def surface(take: Take, motion: MotionConfig, time_s: np.ndarray) -> Surface:
         note = "A recording holds no waves: the water is drawn calm."
         profiles_m = np.zeros((1, len(time_s), points))
     else:
-        sea = parse_sea(take.sea)
+        sea = parse_sea(take.sea.removesuffix(COUPLED))
+        coupled = motion.is_coupled(take.sea)
         role = "train" if motion.split == "paper" else "test"
         seed = table_seed(sea, role, int(take.poses[0].seed[0]))
         cut = paper_rows("test").start * KNOT_DT_S if motion.split == "paper" else 0.0
-        starts_s = take.window_starts_s[:1] if motion.coupled else take.window_starts_s
+        starts_s = take.window_starts_s[:1] if coupled else take.window_starts_s
         (amplitudes,) = wave_amplitudes(sea, seed, knobs)  # one direction: long-crested
         along_m = np.linspace(-REACH_M, REACH_M, points)
         profiles_m = np.stack(
@@ -93,7 +94,7 @@ def surface(take: Take, motion: MotionConfig, time_s: np.ndarray) -> Surface:
         )
         note = (
             "Both vessels in the one wave field that is drawn."
-            if motion.coupled
+            if coupled
             else "Each vessel rides its own window of the sea (as in the paper): the waves drawn "
             "around it are the ones that move it, faded into the other's in between."
         )

@@ -151,7 +151,7 @@ def build_tables(
     role: Role,
     knobs: VesselKnobs | None = None,
     *,
-    coupled: bool = False,
+    coupled: Sequence[bool] = (),
     split: Literal["seeds", "paper"] = "seeds",
     seeds_per_sea: int | None = None,
 ) -> MotionTables:
@@ -161,9 +161,9 @@ def build_tables(
         seas: sea states.
         role: "train" or "test"; their waves never share a seed, or an instant.
         knobs: the vessel; None = the calibrated defaults.
-        coupled: give vessel B the same waves instead of an independent window. Each vessel answers
-            as if alone: no shelter, no interaction, although at the task's separation of 6.5 m
-            full scale the two hulls would overlap.
+        coupled: of each sea: give vessel B the same waves instead of an independent window (none
+            given: in no sea). Each vessel answers as if alone: no shelter, no interaction, although
+            at the task's separation of 6.5 m full scale the two hulls would overlap.
         split: "seeds": 8 hours per sea to train on and another one to test on. "paper": one hour,
             the first 2/3 trains, the last 1/3 tests, 20 s cut at both borders of the test part.
         seeds_per_sea: other than the usual number of hours (split "seeds" only).
@@ -176,10 +176,15 @@ def build_tables(
         seed_role, rows = role, slice(None)
     plan = [(sea, table_seed(sea, seed_role, k)) for sea in seas for k in range(count)]
     companion = None
-    if coupled:
-        companion = np.stack([synthesise(sea, seed, knobs, True)[rows] for sea, seed in plan])
+    knots = np.stack([synthesise(sea, seed, knobs)[rows] for sea, seed in plan])
+    if any(coupled):
+        own = [
+            synthesise(*p, knobs, True)[rows] if coupled[k // count] else knots[k]
+            for k, p in enumerate(plan)
+        ]
+        companion = np.stack(own)
     return MotionTables(
-        knots=np.stack([synthesise(sea, seed, knobs)[rows] for sea, seed in plan]),
+        knots=knots,
         companion=companion,
         sea_index=np.repeat(np.arange(len(seas), dtype=np.int32), count),
         sea_names=tuple(sea.name for sea in seas),
