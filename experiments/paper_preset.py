@@ -4,14 +4,16 @@
     python experiments/paper_preset.py runs/B4_4-paper-s0
 
 All of it is 2500 iterations of 8 x 1000 steps, 80 updates of the policy and 80 of the value each:
-days on a CPU. Writes experiments/paper_preset.csv: what the run has printed so far.
+days on a CPU. Writes experiments/paper_preset.csv, what the run has printed so far,
+and experiments/paper_preset_evaluated.csv, the policy without exploration beside the IK baseline.
 """
 
 import sys
 from pathlib import Path
 
-from record import provenance, write_rows
+from record import provenance, run_rows, write_rows
 
+from mcx_jax import startup
 from mcx_jax.run_dir import METRICS, whole_rows
 
 KEPT = {
@@ -21,14 +23,16 @@ KEPT = {
 
 
 def main() -> None:
-    origin = provenance()
+    startup.configure()
+    run, origin = Path(sys.argv[1]), provenance()
     write_rows(
         "paper_preset",
         [
             {name: f"{row[name]:{form}}" for name, form in KEPT.items()} | origin
-            for row in whole_rows(Path(sys.argv[1]) / METRICS)
+            for row in whole_rows(run / METRICS)
         ],
     )
+    write_rows("paper_preset_evaluated", run_rows(run))
 
 
 if __name__ == "__main__":

@@ -176,6 +176,7 @@ def agents() -> str:
             below = [line for lines in worst for line in lines[1:]]
             found = f"{len(below)} of {6 * len(worst)} below the paper's"
             found += ": " + ", ".join(below) if below else ""
+            found += _below_by_seed(name)
             blocks.append(f"Improvements of top 5 %, top 1 % and maximum over `ik`: {found}.")
         blocks += _beside_classical(cells, "_quiet" if name.endswith("_quiet") else "")
     return "\n\n".join(blocks)
@@ -298,7 +299,16 @@ def paper_preset() -> str:
             ("standard deviation of the exploration, cm and crad", "sigma", 3),
         )
     ]
-    return f"{last['iteration']} iterations; {'; '.join(said)}. Source: {sources(rows)}"
+    cells = {(r["who"], r["sea"]): r for r in read("paper_preset_evaluated")}
+    beside = [
+        f"{sea} {float(cells['ppo', sea][unit]):.1f} / {float(cells['ik', sea][unit]):.1f} {word}"
+        for unit, word in (("pos_mm", "mm"), ("ang_mrad", "mrad"))
+        for sea in SEAS
+    ]
+    return (
+        f"{last['iteration']} iterations; {'; '.join(said)}. Without exploration, the policy / "
+        f"`ik`: {', '.join(beside)}. Source: {sources(rows)}"
+    )
 
 
 def robust() -> str:
@@ -339,6 +349,18 @@ def _lead(cells: dict[tuple[str, str], dict[str, str]], rivals: tuple[str, ...])
     against = f"`{rivals[0]}`" if len(rivals) == 1 else "the best controller without learning"
     found = f"{against} in {len(names) - len(lost)} of {len(names)} conditions"
     return found + (f", not in: {'; '.join(lost)}" if lost else "")
+
+
+def _below_by_seed(name: str) -> str:
+    """The same of every seed by itself, where there are several."""
+    counts: dict[str, list[int]] = {}
+    for row in read(name):
+        if row["who"] != "ik":
+            counts.setdefault(row["seed"], []).append(len(_below_paper(row)) - 1)
+    if len(counts) == 1:
+        return ""
+    each = [f"{sum(found)} of {6 * len(found)} (seed {seed})" for seed, found in counts.items()]
+    return f"; seeds by themselves: {', '.join(each)}"
 
 
 def _below_paper(cell: dict[str, str]) -> list[str]:
