@@ -55,6 +55,8 @@ def main() -> None:
     words, options = sys.argv[1:], []
     if "--" in words:
         words, options = words[: words.index("--")], words[words.index("--") + 1 :]
+    if not words or words[0] not in ("ppo", "first-order"):
+        raise SystemExit(__doc__)
     algo, quiet = words[0], "--quiet" in words
     seeds = int(words[words.index("--seeds") + 1]) if "--seeds" in words else 1
     delays = [word for word in words[1:] if word in DELAYS] or list(DELAYS)

@@ -123,6 +123,18 @@ def test_draws_are_in_their_ranges_and_differ(run):
     np.testing.assert_allclose(run.conditions.noise.angle_rad[0], 2e-3, rtol=1e-6)
 
 
+def test_a_third_of_noise_up_to_3_mm_is_below_a_third_of_a_mm():
+    config = EnvConfig(conditions=ConditionsConfig(noise_mm="0:3", noise_mrad="1:4"))
+    keys = jax.random.split(jax.random.key(0), 4000)
+    noise = jax.vmap(lambda key: conditions.draw(config, key, 0).noise)(keys)
+    assert noise is not None
+    # Quantiles of a number whose root is even: 3 u^2, (1 + u)^2; 4000 draws scatter by 0.008 of u.
+    for u in (0.1, 1 / 3, 0.5, 0.9):
+        position_mm, angle_mrad = 1e3 * noise.position_m, 1e3 * noise.angle_rad
+        assert float(jnp.mean(position_mm < 3 * u**2)) == pytest.approx(u, abs=0.03)
+        assert float(jnp.mean(angle_mrad < (1 + u) ** 2)) == pytest.approx(u, abs=0.03)
+
+
 def test_the_measurement_is_late_and_noisy_and_the_errors_are_true(env, run):
     rotations, positions = (np.asarray(x) for x in true_poses(env, run))
     latency = np.asarray(run.conditions.latency[0])
