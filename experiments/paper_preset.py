@@ -4,7 +4,7 @@
     python experiments/paper_preset.py runs/B4_4-paper-s0
 
 All of it is 2500 iterations of 8 x 1000 steps, 80 updates of the policy and 80 of the value each:
-days on a CPU. Writes experiments/paper_preset.csv, what the run has printed so far,
+ten hours on two free cores. Writes experiments/paper_preset.csv, what the run has printed so far,
 and experiments/paper_preset_evaluated.csv, the policy without exploration beside the IK baseline.
 """
 

@@ -11,6 +11,7 @@ Writes experiments/servo_lead.csv.
 import sys
 import time
 from pathlib import Path
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +33,6 @@ EPISODES, AFTER_STEPS = 400, 10
 
 def episodes(env, controller, keys, gain, share):
     """(dp m, da rad, a joint is too fast), each (steps, N)."""
-    servo.LEAD_MADE_UP = share
     act = jax.vmap(lambda state, memory: controller.act(env, state, memory), -1, -1)
     step = jax.vmap(env.step, -1, -1)
     state = jax.vmap(env.reset, 0, -1)(keys)
@@ -47,7 +47,8 @@ def episodes(env, controller, keys, gain, share):
         fast = jnp.any(lost != 0.0, axis=0)
         return (after, memory), (after.metrics.pos_error_m, after.metrics.ang_error_rad, fast)
 
-    return jax.lax.scan(body, (state, memory), None, env.episode_steps)[1]
+    with mock.patch.object(servo, "LEAD_MADE_UP", share):  # an input: one program for all shares
+        return jax.lax.scan(body, (state, memory), None, env.episode_steps)[1]
 
 
 def soon_after(fast: np.ndarray) -> np.ndarray:

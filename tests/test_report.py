@@ -296,7 +296,7 @@ def test_spectra_of_the_tables_are_the_target():
     from mcx_jax.sea.tables import build_tables
 
     knots = build_tables([parse_sea("Wa"), parse_sea("2.0:9")], "test").knots
-    for s in motion_spectra(knots, ("Wa", "2.0:9"), generated=True):
+    for s in motion_spectra(knots, ("Wa-coupled", "2.0:9"), generated=True):
         np.testing.assert_allclose(s.measured_std, s.target_std, rtol=0.01)
         inside = (s.frequency_hz > 0.25) & (s.frequency_hz < 0.8)
         wanted = np.stack([np.interp(s.frequency_hz[inside], s.target_hz, x) for x in s.target])

@@ -57,6 +57,8 @@ def test_spreading_shares():
 def test_parse_names_and_literals():
     assert parse_sea("Wc") == SeaState(2.0, 9.0, "Wc")
     assert parse_sea("3.0:11") == SeaState(3.0, 11.0, "3.0:11")
+    assert parse_sea("Wc-coupled") == SeaState(2.0, 9.0, "Wc-coupled")
+    assert parse_sea("3.0:11-coupled") == SeaState(3.0, 11.0, "3.0:11-coupled")
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """Commands of the servos: their order, and the lead of a joint that is asked for too much."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -38,7 +40,8 @@ def test_lead_of_each_joint_by_hand(model, joint):
         rate[joint] = sign * speed
         want = np.zeros(6)
         want[joint] = sign * 0.01 * speed / 3
-        # The share is a difference of two speeds of 3 rad/s, times up to 1/0.056: 5e-6 of 1.
+        # The share is a difference of two float32 speeds of 3 rad/s (2e-7), times up to 1/0.056:
+        # 4e-6 of 1; times 0.03 rad.
         np.testing.assert_allclose(servo.lost_lead(model, jnp.asarray(rate)), want, atol=2e-7)
 
 
@@ -54,8 +57,6 @@ def test_nothing_within_the_range_and_all_far_beyond(model, joint):
 
 def test_no_lead_without_a_pair_of_limited_servos(model):
     """Of another arm: a velocity servo without a range, no velocity servo."""
-    from dataclasses import replace
-
     position, velocity = model.actuators[:6], model.actuators[6:]
     free = tuple(replace(act, ctrl_range=None) for act in velocity)
     for actuators in (position + free, position):
@@ -85,5 +86,6 @@ def test_a_fast_shoulder_keeps_its_lead(model, monkeypatch):
         return float(jax.jit(lambda: jax.lax.scan(step, (start, moving), jnp.arange(10)))()[1][-1])
 
     way = speed * CONTROL_DT_S / 2
-    assert lead(0.0) < 0.5 * way
-    assert lead(1.0) == pytest.approx(way, rel=0.2)
+    # A balance at steady speed predicts 1 - 0.62 and 1; the inertia of the way there: 0.44, 0.95.
+    assert lead(0.0) == pytest.approx(0.38 * way, abs=0.1 * way)
+    assert lead(1.0) == pytest.approx(way, abs=0.1 * way)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from mcx_jax.delay import CONTROL_DT_S, SUBSTEPS
-from mcx_jax.env_config import COUPLED, MotionConfig
+from mcx_jax.env_config import MotionConfig
 from mcx_jax.errors import UserError
 from mcx_jax.sea.sampler import KNOT_STEPS
 
@@ -106,10 +106,10 @@ def _generated(config: MotionConfig, split: Literal["train", "test"]):
     from mcx_jax.sea.tables import build_tables
 
     names = NAMED_SEAS if config.sea == "all" else tuple(config.sea.split(","))
-    seas = [parse_sea(name.removesuffix(COUPLED)) for name in names]
+    seas = [parse_sea(name) for name in names]
     coupled = tuple(config.is_coupled(name) for name in names)
     tables = build_tables(seas, split, coupled=coupled, split=config.split)
-    return names, tables.knots, tables.companion, coupled
+    return tables.sea_names, tables.knots, tables.companion, coupled
 
 
 def _recorded(config: MotionConfig, split: Literal["train", "test"]):

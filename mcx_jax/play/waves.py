@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mcx_jax.env_config import COUPLED, MotionConfig
+from mcx_jax.env_config import MotionConfig
 from mcx_jax.play.episode import Take
 from mcx_jax.sea.hydro import VesselKnobs
 from mcx_jax.sea.spectrum import GRAVITY_M_S2, parse_sea
@@ -81,7 +81,7 @@ def surface(take: Take, motion: MotionConfig, time_s: np.ndarray) -> Surface:
         note = "A recording holds no waves: the water is drawn calm."
         profiles_m = np.zeros((1, len(time_s), points))
     else:
-        sea = parse_sea(take.sea.removesuffix(COUPLED))
+        sea = parse_sea(take.sea)
         coupled = motion.is_coupled(take.sea)
         role = "train" if motion.split == "paper" else "test"
         seed = table_seed(sea, role, int(take.poses[0].seed[0]))

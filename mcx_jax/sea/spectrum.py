@@ -6,10 +6,11 @@ paper's table 1 (Herland & Bach, AAAI 2023).
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mcx_jax.env_config import COUPLED
 from mcx_jax.errors import UserError
 
 GRAVITY_M_S2 = 9.81
@@ -49,15 +50,17 @@ def parse_sea(text: str) -> SeaState:
     """Sea state from a name or a literal.
 
     Args:
-        text: "Wa" .. "Wd", or "Hs:Tp" in metres and seconds at full scale, e.g. "3.0:11".
+        text: "Wa" .. "Wd", or "Hs:Tp" in metres and seconds at full scale, e.g. "3.0:11"; an ending
+            "-coupled" stays in the name and is the same sea.
 
     Raises:
         UserError: neither, or no sea that water can carry.
     """
-    if text in SEAS:
-        return SEAS[text]
+    sea = text.removesuffix(COUPLED)
+    if sea in SEAS:
+        return replace(SEAS[sea], name=text)
     valid = f"use {', '.join(SEAS)} or Hs:Tp in metres and seconds at full scale, e.g. 3.0:11"
-    parts = text.split(":")
+    parts = sea.split(":")
     try:
         hs_m, tp_s = (float(part) for part in parts)
     except ValueError:
