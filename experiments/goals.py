@@ -3,8 +3,9 @@
     python experiments/goals.py
 
 Trains one agent on `--goal lissajous` (gone on with if it is not finished) and evaluates it on
-every path beside the controllers without learning, `fir` fitted on that path, and the agent that
-was trained on goals at rest. Writes experiments/goals.csv: means over four seas, 50 episodes each.
+every path beside the controllers without learning, `fir` fitted on that path, and the agents that
+were trained on goals at rest (PPO's by experiments/sweep.py). Writes experiments/goals.csv: means
+over four seas, 50 episodes each.
 """
 
 import subprocess
@@ -29,6 +30,8 @@ WHO = {
     "extrapolate": "extrapolate",
     "extrapolate-best": "extrapolate-best",
     "fir": "fir",
+    "preview": "preview",
+    "ppo, goal at rest": "runs/B4_4-fast-s0",
     "first-order, goal at rest": "shipped:B4_4",
     "first-order, lissajous": str(RUN),
 }

@@ -2,7 +2,7 @@
 
     python experiments/robust.py WHO...
 
-WHO are ik, extrapolate, extrapolate-best, fir, and trained policies (directories, .npz,
+WHO are ik, extrapolate, extrapolate-best, fir, preview, and trained policies (directories, .npz,
 shipped:robust) for B4_4 or several delays; the file's rows of others are kept. Every condition is
 measured on the same windows of motion and goals, 24 episodes in each of the four seas; one compiled
 program per controller runs all conditions. `extrapolate` and `fir` believe in B4_4 throughout and
@@ -126,7 +126,7 @@ def controller_of(who: str):
 
 def order(who: str) -> int:
     """Column of a controller: classical ones, then agents."""
-    known = ("ik", "extrapolate", *FITTED, "ppo", "first-order", "robust")
+    known = ("ik", "extrapolate", *FITTED, "preview", "ppo", "first-order", "robust")
     return known.index(who) if who in known else len(known)
 
 

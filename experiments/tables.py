@@ -118,15 +118,36 @@ def baseline() -> str:
     return markdown(header, rows) + "\n\nSource: " + sources(cells.values())
 
 
+def _everyone(delay: str) -> list[dict[str, str]]:
+    """Every controller's rows of a delay, in the paper's world."""
+    found = []
+    for who in (*LEARNS_NOTHING, "preview"):
+        found += [r for r in read(f"baseline_{who}") if r["delay"] == delay]
+    for name in ("ppo", "first_order"):
+        trained = [r for r in over_seeds(name) if r["who"] != "ik" and r["delay"] == delay]
+        found += [{**r, "trained": r["steps"]} for r in trained]
+    return found
+
+
+def all_delays() -> str:
+    """Everybody side by side, every delay."""
+    rows, stored = [], []
+    for delay in DELAYS:
+        everyone = _everyone(delay)
+        cells = {(r["who"], r["sea"]): r for r in everyone}
+        for who in dict.fromkeys(r["who"] for r in everyone):
+            values = [float(cells[who, s][unit]) for unit in ("pos_mm", "ang_mrad") for s in SEAS]
+            rows.append([delay, who, *map(_short, values)])
+        paper = [cells["preview", s][f"{u}_paper"] for u in ("pos_mm", "ang_mrad") for s in SEAS]
+        rows.append([delay, "paper's agent", *paper])
+        stored += everyone
+    header = ["delay", "who", *(f"{s} mm" for s in SEAS), *(f"{s} mrad" for s in SEAS)]
+    return markdown(header, rows) + "\n\nSource: " + sources(stored)
+
+
 def controllers() -> str:
     """B4_4: everybody side by side."""
-    everyone = []
-    for who in (*LEARNS_NOTHING, "preview"):
-        everyone += [r for r in read(f"baseline_{who}") if r["delay"] == "B4_4"]
-    for name in ("ppo", "first_order"):
-        trained = [r for r in over_seeds(name) if r["who"] != "ik" and r["delay"] == "B4_4"]
-        everyone += [{**r, "trained": r["steps"]} for r in trained]
-    rows = []
+    everyone, rows = _everyone("B4_4"), []
     for who in dict.fromkeys(r["who"] for r in everyone):
         cells = {r["sea"]: r for r in everyone if r["who"] == who}
         first = cells["Wa"]
@@ -467,6 +488,7 @@ TABLES = {
     "headline": headline,
     "baseline": baseline,
     "controllers": controllers,
+    "all_delays": all_delays,
     "agents": agents,
     "robust": robust,
     "goals": goals,
