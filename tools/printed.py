@@ -1,15 +1,19 @@
-"""What the commands on the site print: runs them and keeps their output in docs/printed/.
+"""Output of the commands shown on the pages: runs them, stores what they print, fills the pages.
 
-    python docs/printed.py              # the quick ones, which tests/test_docs.py compares
-    python docs/printed.py NAME ...     # these
-    python docs/printed.py all          # every one: half an hour on two cores
+    python tools/printed.py              # the quick ones, which tests/test_docs.py compares
+    python tools/printed.py NAME ...     # these
+    python tools/printed.py all          # every one: half an hour on two cores
+    python tools/printed.py pages        # only copies the stored output into the pages
 
-Every command runs in an empty directory that has `docs` and `runs` of this source tree. Output of
-what computes ends with the commit, the day and the machine.
+Every command runs in an empty directory that has `docs` and `runs` of this source tree. Its output
+is stored in docs/printed/NAME.txt, and stands on a page between `<!-- printed: NAME ... -->` and
+`<!-- end -->`, so that a page is complete wherever it is read. Output of a computation ends with
+the commit, the day and the machine, and needs a clean tree.
 """
 
 import datetime
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -89,24 +93,47 @@ def tidied(text: str) -> str:
     return "\n".join(line for line in lines if not line.startswith("XLA_FLAGS += "))
 
 
-def provenance(seconds: float) -> str:
-    """When and where something was computed."""
-    git = ["git", "rev-parse", "--short", "HEAD"]
-    commit = subprocess.run(git, capture_output=True, text=True, cwd=ROOT).stdout.strip()
+def provenance() -> str:
+    """When and where something was computed; no seconds, since other programs run here too."""
     day = datetime.date.today().isoformat()
-    return f"# {seconds:.0f} s; commit {commit}, {day}, cpu, {os.cpu_count()} cores, busy"
+    return f"# commit {commit()}, {day}, cpu, {os.cpu_count()} cores"
+
+
+def commit() -> str:
+    """The commit that the program is of; refuses a tree in which tracked files differ from it."""
+    git = ["git", "describe", "--always", "--exclude=*", "--dirty=+"]
+    name = subprocess.run(git, capture_output=True, text=True, cwd=ROOT).stdout.strip()
+    if name.endswith("+"):
+        raise SystemExit("commit your changes first: stored output names the commit it comes from")
+    return name
+
+
+def filled(page: str) -> str:
+    """A page with its boxes filled from `printed: NAME ...` (stored output) or `file: PATH`."""
+
+    def box(match: re.Match[str]) -> str:
+        kind, names = match[1], match[2].split()
+        paths = [FOLDER / f"{x}.txt" if kind == "printed" else ROOT / x for x in names]
+        text = "\n".join(path.read_text().rstrip("\n") for path in paths)
+        language = "text" if kind == "printed" else "bash"
+        return f"<!-- {kind}: {match[2]} -->\n```{language}\n{text}\n```\n<!-- end -->"
+
+    return re.sub(r"<!-- (printed|file): (.*?) -->\n.*?<!-- end -->", box, page, flags=re.DOTALL)
 
 
 def main(names: list[str]) -> None:
-    """Run the commands named and write their files."""
+    """Run the commands named, store their output and fill the pages."""
     every = QUICK | SLOW
-    for name in list(every if names == ["all"] else names or QUICK):
-        begun = time.monotonic()
+    chosen = [] if names == ["pages"] else list(every if names == ["all"] else names or QUICK)
+    origin = provenance() if set(chosen) & set(SLOW) else ""
+    for name in chosen:
+        started = time.monotonic()
         lines = [f"$ {command_line(every[name])}", printed(every[name])]
-        if name in SLOW:
-            lines.append(provenance(time.monotonic() - begun))
+        lines += [origin] if name in SLOW else []
         (FOLDER / f"{name}.txt").write_text("\n".join(lines) + "\n")
-        print(f"docs/printed/{name}.txt, {time.monotonic() - begun:.0f} s", flush=True)
+        print(f"docs/printed/{name}.txt, {time.monotonic() - started:.0f} s", flush=True)
+    for path in sorted((ROOT / "docs").rglob("*.md")):
+        path.write_text(filled(path.read_text()))
 
 
 if __name__ == "__main__":
