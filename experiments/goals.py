@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from record import provenance, write_rows
+from record import commit, provenance, write_rows
 
 from mcx_jax import startup
 from mcx_jax.checkpoint import latest
@@ -46,6 +46,7 @@ def train() -> None:
 
 
 def main() -> None:
+    commit()
     train()
     startup.configure()
     rows = []

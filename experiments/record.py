@@ -1,6 +1,7 @@
 """What every stored result carries: the command, the commit, the machine and the versions."""
 
 import csv
+import functools
 import json
 import os
 import subprocess
@@ -14,18 +15,28 @@ from tables import read
 FOLDER = Path(__file__).parent
 
 
+@functools.cache
+def commit() -> str:
+    """The commit that runs; refuses a tree with uncommitted changes.
+
+    A script calls it first: before hours of work, and before anything else is committed.
+    """
+    command = ["git", "describe", "--always", "--dirty=+"]
+    name = subprocess.run(command, capture_output=True, text=True, cwd=FOLDER).stdout.strip()
+    if name.endswith("+"):
+        raise SystemExit("commit your changes first: a stored result names the commit it is of")
+    return name
+
+
 def provenance() -> dict[str, str]:
     """Columns that end every row of a stored result."""
     import jax
     import mujoco
 
     command = " ".join(["python", "experiments/" + Path(sys.argv[0]).name, *sys.argv[1:]])
-    commit = subprocess.run(
-        ["git", "describe", "--always", "--dirty=+"], capture_output=True, text=True, cwd=FOLDER
-    ).stdout.strip()
     device = f"{jax.devices()[0].platform}, {os.cpu_count()} cores"
     versions = {"jax": jax.__version__, "mujoco": mujoco.__version__}
-    return {"command": command, "commit": commit, "device": device, **versions}
+    return {"command": command, "commit": commit(), "device": device, **versions}
 
 
 def write_rows(name: str, rows: list[dict]) -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from record import kept, provenance, write_rows
+from record import commit, kept, provenance, write_rows
 
 from mcx_jax import startup
 from mcx_jax.assets import SHIPPED
@@ -131,6 +131,7 @@ def order(who: str) -> int:
 
 
 def main() -> None:
+    commit()
     startup.configure()
     controllers = {}
     for who in sys.argv[1:]:

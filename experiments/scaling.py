@@ -15,7 +15,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from record import provenance, write_rows
+from record import commit, provenance, write_rows
 
 from mcx_jax.startup import DEVICES_FLAG, PASSES_FLAG, SPLIT_PASS
 
@@ -62,6 +62,7 @@ def steps_per_s(processes: int, devices: int, bound: bool) -> float:
 
 
 def main() -> None:
+    commit()
     rows, alone = [], None
     for processes, devices, bound in ROWS:
         rate = steps_per_s(processes, devices, bound)

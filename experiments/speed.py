@@ -10,12 +10,13 @@ import json
 import sys
 from pathlib import Path
 
-from record import FOLDER, provenance, write_rows
+from record import FOLDER, commit, provenance, write_rows
 
 from mcx_jax import startup
 
 
 def main() -> None:
+    commit()
     startup.configure()
     from mcx_jax.bench.__main__ import run
     from mcx_jax.bench.plot import draw

@@ -12,7 +12,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from record import kept, run_rows, write_rows
+from record import commit, kept, run_rows, write_rows
 
 from mcx_jax import startup
 from mcx_jax.checkpoint import latest
@@ -52,6 +52,7 @@ def trained(algo: str, delay: str, seeds: int, quiet: bool, options: list[str]) 
 
 
 def main() -> None:
+    commit()
     words, options = sys.argv[1:], []
     if "--" in words:
         words, options = words[: words.index("--")], words[words.index("--") + 1 :]

@@ -16,12 +16,19 @@ ROOT = FOLDER.parent
 PAGES = (
     "README.md",
     "docs/results.md",
+    "docs/speed.md",
     "docs/paper.md",
     "docs/task.md",
     "docs/cluster.md",
     "docs/trust.md",
 )
-SEAS = ("Wa", "Wb", "Wc", "Wd")
+SEA_NAMES = {
+    "Wa": "Wa: Hs 1.0 m, Tp 6 s",
+    "Wb": "Wb: Hs 1.5 m, Tp 8 s",
+    "Wc": "Wc: Hs 2.0 m, Tp 9 s",
+    "Wd": "Wd: Hs 2.5 m, Tp 10 s",
+}
+SEAS = tuple(SEA_NAMES)
 DELAYS = ("E0", "B4_21", "E1", "B4_4", "E2")
 
 
@@ -31,8 +38,9 @@ def read(name: str) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-LEARNS_NOTHING = ("ik", "extrapolate", "extrapolate-best", "fir")
-"""Controllers that see what an agent sees."""
+LEARNS_NOTHING = ("ik", "extrapolate", "fir")
+"""Controllers that see what an agent sees. `extrapolate-best` is left out: the best lead that it
+finds is the one that `extrapolate` has, so that their errors are the same in every cell."""
 
 
 def over_seeds(name: str) -> list[dict[str, str]]:
@@ -49,9 +57,7 @@ def over_seeds(name: str) -> list[dict[str, str]]:
             for key in rows[0]
             if key.startswith(("pos_mm", "ang_mrad", "gain_")) and not key.endswith("_paper")
         }
-        # Seeds of one call share its seconds.
-        seconds = sum(float(s) for s in {r["train_seconds"] for r in rows})
-        out.append({**rows[0], **mean, "seeds": str(len(rows)), "train_seconds": f"{seconds:.0f}"})
+        out.append({**rows[0], **mean, "seeds": str(len(rows))})
     return out
 
 
@@ -70,36 +76,25 @@ def markdown(header: list[str], rows: list[list[str]]) -> str:
 
 
 def headline() -> str:
-    """The numbers of the first screen."""
+    """Delay B4_4 in the paper's world: what the README shows."""
+    cells = {(r["who"], r["sea"]): r for r in _everyone("B4_4")}
+    columns = {
+        "no correction (`ik`)": "ik",
+        "best without learning (`fir`)": "fir",
+        "here, PPO": "ppo",
+        "here, first-order": "first-order",
+    }
     rows = []
-    cells = read("baseline_ik")
-    names = ("pos_mm", "ang_mrad")
-    ratios = [math.log(float(r[n]) / float(r[f"{n}_paper"])) for r in cells for n in names]
-    rms = math.sqrt(sum(x * x for x in ratios) / len(ratios))
-    worst = 100 * (math.exp(max(ratios, key=abs)) - 1)
-    value = f"rms log ratio {rms:.3f}, worst cell {worst:+.0f} %"
-    what = "IK baseline against table 3's implied one, 40 cells"
-    rows.append([what, value, f"`{cells[0]['command']}`"])
-    for name, label in (
-        ("ppo", "PPO"),
-        ("first_order", "gradient through the simulator"),
-        ("first_order_quiet", "the same where servos do not chatter"),
-    ):
-        stored = [r for r in over_seeds(name) if r["delay"] == "B4_4"]
-        found = {(r["who"] == "ik", r["sea"]): r for r in stored}
-        gains = [
-            100 * (1 - float(found[False, s]["pos_mm"]) / float(found[True, s]["pos_mm"]))
-            for s in SEAS
-        ]
-        one = found[False, "Wa"]
-        what = f"{label}, delay B4_4, {int(one['steps']) / 1e6:.1f} M control steps"
-        value = f"position error {_gain(min(gains))} to {_gain(max(gains))} % below the baseline's"
-        rows.append([what, value, f"`{one['command']}`"])
-    return markdown(["what", "here", "command"], rows)
+    for sea, name in SEA_NAMES.items():
+        errors = [_pair(cells[who, sea], "") for who in columns.values()]
+        rows.append([name, *errors, _pair(cells["fir", sea], "_paper")])
+    table = markdown(["sea, full scale", *columns, "paper's agent"], rows)
+    return f"{table}\n\nRows, commands, commits: `experiments/*.csv`."
 
 
-def _gain(percent: float) -> str:
-    return f"{percent:.0f}" if percent < 99 else f"{percent:.1f}"
+def _pair(row: dict[str, str], ending: str) -> str:
+    pos, ang = (float(row[unit + ending]) for unit in ("pos_mm", "ang_mrad"))
+    return f"{pos:.2f} mm, {ang:.2f} mrad"
 
 
 def baseline() -> str:
@@ -124,8 +119,7 @@ def _everyone(delay: str) -> list[dict[str, str]]:
     for who in (*LEARNS_NOTHING, "preview"):
         found += [r for r in read(f"baseline_{who}") if r["delay"] == delay]
     for name in ("ppo", "first_order"):
-        trained = [r for r in over_seeds(name) if r["who"] != "ik" and r["delay"] == delay]
-        found += [{**r, "trained": r["steps"]} for r in trained]
+        found += [r for r in over_seeds(name) if r["who"] != "ik" and r["delay"] == delay]
     return found
 
 
@@ -145,27 +139,6 @@ def all_delays() -> str:
     return markdown(header, rows) + "\n\nSource: " + sources(stored)
 
 
-def controllers() -> str:
-    """B4_4: everybody side by side."""
-    everyone, rows = _everyone("B4_4"), []
-    for who in dict.fromkeys(r["who"] for r in everyone):
-        cells = {r["sea"]: r for r in everyone if r["who"] == who}
-        first = cells["Wa"]
-        label = who
-        if "trained" in first:
-            label = f"{who}, {int(first['steps']) / 1e6:.1f} M steps, {first['train_seconds']} s"
-            label += f" for {first['seeds']} seeds" if first["seeds"] != "1" else ""
-        values = [
-            f"{float(cells[s]['pos_mm']):.2f} mm, {float(cells[s]['ang_mrad']):.2f} mrad"
-            for s in SEAS
-        ]
-        rows.append([label, *values])
-    agents = {r["sea"]: r for r in everyone if r["who"] == "preview"}
-    paper = [f"{agents[s]['pos_mm_paper']} mm, {agents[s]['ang_mrad_paper']} mrad" for s in SEAS]
-    rows.append(["paper's agents, 20 M steps", *paper])
-    return markdown(["B4_4", *SEAS], rows) + "\n\nSource: " + sources(everyone)
-
-
 def agents() -> str:
     """Agents of all delays beside the paper's."""
     blocks = []
@@ -182,12 +155,9 @@ def agents() -> str:
             row = [delay]
             for unit in ("pos_mm", "ang_mrad"):
                 row += [f"{_short(float(r[unit]))} / {r[unit + '_paper']}" for r in mine]
-            steps, minutes = int(mine[0]["steps"]) / 1e6, float(mine[0]["train_seconds"]) / 60
-            each = " each" if mine[0]["seeds"] != "1" else ""
-            trained = f"{steps:.1f} M steps{each}, {minutes:.1f} min"
-            rows.append([*row, trained, mine[0]["seeds"]])
+            rows.append([*row, f"{int(mine[0]['steps']) / 1e6:.1f} M", mine[0]["seeds"]])
         header = [what, *(f"{s} mm" for s in SEAS), *(f"{s} mrad" for s in SEAS)]
-        table = markdown([*header, "trained", "seeds"], rows)
+        table = markdown([*header, "steps", "seeds"], rows)
         blocks.append(table + "\n\nSource: " + sources(cells.values()))
         blocks += _over_seeds_line(name)
         if name == "first_order_implicitfast":
@@ -262,7 +232,7 @@ def _over_seeds_line(name: str) -> list[str]:
 
 def goals() -> str:
     """Goals that move on the deck."""
-    stored = read("goals")
+    stored = [r for r in read("goals") if r["who"] != "extrapolate-best"]
     cells = {(r["who"], r["goal"]): r for r in stored}
     paths = list(dict.fromkeys(r["goal"] for r in stored))
     rows = [
@@ -334,7 +304,7 @@ def paper_preset() -> str:
 
 def robust() -> str:
     """Where the task is hard: controllers side by side."""
-    stored = read("robust")
+    stored = [r for r in read("robust") if r["who"] != "extrapolate-best"]
     cells = {(r["condition"], r["who"]): r for r in stored}
     whos = list(dict.fromkeys(r["who"] for r in stored))
     rows = [
@@ -436,6 +406,14 @@ def speed() -> str:
     return markdown(["what", "here"], rows) + "\n\nSource: " + source(stored[0])
 
 
+def speed_summary() -> str:
+    """The rows of `speed` that the README shows."""
+    lines = speed().split("\n")
+    wanted = ("physics steps of", "C MuJoCo, `mujoco.batch`", "MJX,", "environment,", "PPO,")
+    chosen = [x for x in lines if x.startswith(tuple(f"| {name}" for name in wanted))]
+    return "\n".join([*lines[:2], *chosen])
+
+
 def scaling() -> str:
     """Training with as many environments a device, on more and more devices."""
     stored = read("scaling")
@@ -487,13 +465,13 @@ def _setting(value: object) -> str:
 TABLES = {
     "headline": headline,
     "baseline": baseline,
-    "controllers": controllers,
     "all_delays": all_delays,
     "agents": agents,
     "robust": robust,
     "goals": goals,
     "long_run": long_run,
     "speed": speed,
+    "speed_summary": speed_summary,
     "scaling": scaling,
     "observation": observation,
     "presets": presets,

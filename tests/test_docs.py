@@ -56,6 +56,11 @@ def pages(docs):
 
 
 @pytest.fixture(scope="module")
+def readme(repo_root):
+    return (repo_root / "README.md").read_text()
+
+
+@pytest.fixture(scope="module")
 def printed(repo_root):
     """tools/printed.py as a module."""
     spec = importlib.util.spec_from_file_location("printed", repo_root / "tools" / "printed.py")
@@ -168,9 +173,9 @@ def test_links_lead_somewhere(docs, pages, repo_root):
         assert (repo_root / path).is_file(), path
 
 
-def test_commands_are_understood(pages, printed, repo_root, tmp_path, monkeypatch):
+def test_commands_are_understood(pages, printed, readme, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # export refuses a file that is there
-    texts = [*pages.values(), (repo_root / "README.md").read_text()]
+    texts = [*pages.values(), readme]
     # Boxes also show commands that are refused; those that compute come from their list instead.
     box = re.compile("<!-- printed:.*?<!-- end -->", re.DOTALL)
     texts = [box.sub("", text) for text in texts]
@@ -236,9 +241,10 @@ def test_the_example_log_is_what_the_page_says(pages, docs, tmp_path, monkeypatc
     assert abs(log.knots - authors.knots)[:, 10:rows, :6].max() < 1e-3
 
 
-def test_printed_files_are_of_the_commands(pages, printed):
+def test_printed_files_are_of_the_commands(pages, printed, readme):
     every = printed.QUICK | printed.SLOW
-    boxes = re.findall(r"^<!-- printed: (.*) -->$", "".join(pages.values()), re.MULTILINE)
+    text = "".join([*pages.values(), readme])
+    boxes = re.findall(r"^<!-- printed: (.*) -->$", text, re.MULTILINE)
     assert {name for box in boxes for name in box.split()} == set(every)
     assert {p.stem for p in printed.FOLDER.glob("*.txt")} == set(every)
     for name, command in every.items():
@@ -247,8 +253,8 @@ def test_printed_files_are_of_the_commands(pages, printed):
         assert (name in printed.QUICK) or re.fullmatch(r"# commit \w+, .*", last), name
 
 
-def test_pages_hold_the_stored_output(pages, printed):
-    for page, text in pages.items():
+def test_pages_hold_the_stored_output(pages, printed, readme):
+    for page, text in {**pages, "README.md": readme}.items():
         assert printed.filled(text) == text, f"{page}: run: python tools/printed.py pages"
     assert "--8<--" not in "".join(pages.values())
 

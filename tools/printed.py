@@ -23,7 +23,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDER = ROOT / "docs" / "printed"
-COLUMNS = "100"
+COLUMNS = "80"
 
 QUICK = {
     **{
@@ -39,6 +39,8 @@ QUICK = {
 EXTRAPOLATE = "evaluate extrapolate --delay B4_4 --sea Wd"
 POLICY = "evaluate runs/B4_4-first-order-s0 --delay"
 SLOW = {
+    "shipped": "evaluate shipped:B4_4 --delay B4_4",
+    "quick-train": "train --algo first-order --delay B4_4 --total-steps 500000 --run-dir quick",
     "sea": "sea",
     "ik": "evaluate ik --delay B4_4 --sea all",
     "extrapolate": EXTRAPOLATE,
@@ -132,7 +134,7 @@ def main(names: list[str]) -> None:
         lines += [origin] if name in SLOW else []
         (FOLDER / f"{name}.txt").write_text("\n".join(lines) + "\n")
         print(f"docs/printed/{name}.txt, {time.monotonic() - started:.0f} s", flush=True)
-    for path in sorted((ROOT / "docs").rglob("*.md")):
+    for path in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))):
         path.write_text(filled(path.read_text()))
 
 
