@@ -181,7 +181,7 @@ def test_commands_are_understood(pages, printed, readme, tmp_path, monkeypatch):
     texts = [box.sub("", text) for text in texts]
     texts += [printed.command_line(x) for x in printed.SLOW.values()]
     found = [command for text in texts for command in commands(text)]
-    assert len(found) > 40
+    assert len(found) > 30
     for module, words in found:
         parse(module, words)
 
@@ -192,7 +192,7 @@ def test_flags_in_the_text_exist(pages):
     for page, text in pages.items():
         prose = re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
         prose = re.sub(r"`python experiments/[^`]*`", "", prose)  # scripts have their own
-        for flag in re.findall(r"(?<![\w-])--[a-z][a-z-]+\w", prose):
+        for flag in re.findall(r"(?<![\w-])--(?!xla_)[a-z][a-z-]+\w", prose):
             assert flag in known, (page, flag)
 
 
