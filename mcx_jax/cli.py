@@ -119,7 +119,7 @@ def optional_value(argv: Sequence[str], flag: str, default: str) -> list[str]:
 
 
 def check_output(flag: str, path: str) -> None:
-    """Refuse, before any work, a file that could not be written at its end.
+    """Refuse, before any work, a file that could not be written at its end, or that is not empty.
 
     Args:
         path: as given with `flag`; "" (none) and "-" (standard output) are fine.
@@ -132,6 +132,8 @@ def check_output(flag: str, path: str) -> None:
         raise UserError(f"{flag} {path}: no such directory")
     if target.is_dir():
         raise UserError(f"{flag} {path}: is a directory; name a file")
+    if target.is_file() and target.stat().st_size:
+        raise UserError(f"{flag} {path}: exists already; name another file, or remove it")
     if not os.access(target if target.exists() else target.parent, os.W_OK):
         raise UserError(f"{flag} {path}: not writable; choose another file")
 

@@ -1,6 +1,8 @@
 """Command lines and configuration files: each mistake is one line with the flag and what to do."""
 
+import importlib
 import json
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -133,6 +135,38 @@ def test_difference_names_the_flag():
     assert cli.difference(config, config) is None
     other = replace(config, env=replace(config.env, delay="E1"))
     assert cli.difference(config, other) == "--delay B4_4, not E1"
+
+
+OUTPUTS = {
+    "evaluate": (["ik"], "--json", ".json"),
+    "sea": ([], "--json", ".json"),
+    "bench --json": (["--quick"], "--json", ".json"),
+    "bench --plot": (["--quick"], "--plot", ".png"),
+    "play --video": (["ik"], "--video", ".mp4"),
+    "play --frame": (["ik"], "--frame", ".png"),
+    "export": (["shipped:E2"], "--out", ".npz"),
+}
+
+
+@pytest.mark.parametrize("name", OUTPUTS)
+def test_no_command_overwrites_a_file(tmp_path, name):
+    options, flag, ending = OUTPUTS[name]
+    file = tmp_path / f"mine{ending}"
+    file.write_text("mine")
+    module = name.split()[0]
+    package = "mcx_jax." + module + (".__main__" if module in ("sea", "bench", "play") else "")
+    with pytest.raises(UserError) as error:
+        importlib.import_module(package).main([*options, flag, str(file)])
+    said = f"{flag} {file}: exists already; name another file, or remove it"
+    assert str(error.value) == said and file.read_text() == "mine"
+
+
+def test_empty_files_and_devices_are_written_to(tmp_path):
+    """mktemp makes an empty one; /dev/null and a pipe lose nothing."""
+    (tmp_path / "empty").write_text("")
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "empty", tmp_path / "pipe", "/dev/null", tmp_path / "new"):
+        cli.check_output("--json", str(path))
 
 
 def test_parsing_needs_no_jax():

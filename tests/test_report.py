@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -23,8 +24,9 @@ from mcx_jax.policy import Policy, PolicyMeta, save_policy
 from mcx_jax.ppo.networks import init_params
 from mcx_jax.ppo.normalise import init_stats
 from mcx_jax.report import entries, style
-from mcx_jax.report.__main__ import check_out, main
+from mcx_jax.report.__main__ import main
 from mcx_jax.report.episode import lag_s, record
+from mcx_jax.report.folder import check_out, write
 from mcx_jax.report.noise import noise_sweep
 from mcx_jax.report.spectra import motion_spectra
 from mcx_jax.report.table import table
@@ -211,17 +213,62 @@ def test_recorded_episode_is_evaluates(made):
     assert 0.04 < lag < 0.07, lag
 
 
-def test_written_again_over_an_earlier_report_only(made, tmp_path):
-    out, run = made
-    other = tmp_path / "mine"
-    other.mkdir()
-    (other / "notes.txt").write_text("mine")
-    refused(
-        [str(run), "--out", str(other)],
-        f"--out {other}: holds other files; name a new or an empty directory",
-    )
-    assert [path.name for path in other.iterdir()] == ["notes.txt"]
-    assert check_out(str(out)) == out
+def contents(folder):
+    return {p.name: p.read_bytes() for p in folder.iterdir()}
+
+
+def test_replaces_its_own_files_and_nothing_else(tmp_path):
+    out = tmp_path / "out"
+    write(check_out(str(out)), "<p>1", {"a": b"1", "b": b"1"}, {"rows": [0.1, "\udcff"]})
+    (out / ".hidden").write_bytes(b"mine")
+    first = contents(out)
+    write(check_out(str(out)), "<p>2", {"a": b"2"}, {"rows": []})
+    second = contents(out)
+    assert sorted(second) == [".hidden", "a.png", "index.html", "results.json"]
+    assert second[".hidden"] == b"mine" and second["a.png"] == b"2"
+    assert second["index.html"] != first["index.html"]
+
+
+CHANGES = {
+    "holiday.png": lambda out: (out / "holiday.png").write_bytes(b"mine"),
+    "notes": lambda out: (out / "notes").mkdir(),
+    "index.html": lambda out: (out / "index.html").write_text("edited"),
+    "a.png": lambda out: ((out / "a.png").unlink(), (out / "a.png").symlink_to(out / "b.png")),
+    "results.json": lambda out: (out / "results.json").write_text('{"kind": "mcx_jax report"}'),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_what_no_report_wrote_is_refused_and_stays(tmp_path, name):
+    out = tmp_path / "out"
+    write(out, "<p>1", {"a": b"1", "b": b"1"}, {})
+    CHANGES[name](out)
+    before = sorted((p.name, p.is_dir() or p.read_bytes()) for p in out.iterdir())
+    with pytest.raises(UserError, match=f"--out {out}: holds .*, which no report wrote, or which"):
+        check_out(str(out))
+    if name not in ("holiday.png", "notes"):  # of those names the report has no file
+        with pytest.raises(UserError, match="which no report wrote"):
+            write(out, "<p>2", {"a": b"2"}, {})
+    else:
+        write(out, "<p>1", {"a": b"1", "b": b"1"}, {})
+    assert before == sorted((p.name, p.is_dir() or p.read_bytes()) for p in out.iterdir())
+
+
+def test_a_manifest_cannot_name_files_elsewhere(tmp_path):
+    out, mine = tmp_path / "out", tmp_path / "mine"
+    mine.write_bytes(b"1")
+    write(out, "<p>1", {"../mine": b"1"}, {})
+    os.rename(tmp_path / "mine.png", mine)
+    text = (out / "results.json").read_text().replace("../mine.png", "../mine")
+    (out / "results.json").write_text(text)
+    write(check_out(str(out)), "<p>2", {}, {})
+    assert mine.read_bytes() == b"1"
+
+
+def test_a_report_holds_no_nan(tmp_path):
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write(tmp_path / "out", "", {}, {"rows": [float("nan")]})
+    assert not list((tmp_path / "out").iterdir())
 
 
 def refused(argv, message):

@@ -4,22 +4,17 @@ RUN is what `evaluate` takes; ik is always there.
 """
 
 import dataclasses
-import json
-import os
 import sys
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import tyro
 
 from mcx_jax import cli
 from mcx_jax.env_config import EnvConfig, MotionConfig
-from mcx_jax.errors import UserError, reason
+from mcx_jax.errors import UserError
 from mcx_jax.evaluate import EvaluateConfig
-
-PAGE, RESULTS = "index.html", "results.json"
-KIND = "mcx_jax report"
+from mcx_jax.report.folder import PAGE, check_out, write
 
 
 @dataclass(frozen=True)
@@ -50,34 +45,6 @@ class ReportConfig:
             raise UserError(f"--show {self.show}: must be 0 to {self.episodes - 1} (--episodes)")
 
 
-def check_out(out: str) -> Path:
-    """The directory to write to.
-
-    Raises:
-        UserError: none named, a file, or a directory with something else in it.
-    """
-    if not out:
-        raise UserError("--out is missing: name a directory for the report")
-    path = Path(out)
-    cli.check_name("--out", path)
-    if path.exists() and not path.is_dir():
-        raise UserError(f"--out {out}: is a file; name a directory")
-    if path.is_dir() and any(path.iterdir()) and not _is_report(path):
-        raise UserError(f"--out {out}: holds other files; name a new or an empty directory")
-    # Before minutes of evaluation, not after.
-    parent = next(p for p in (path, *path.absolute().parents) if p.exists())
-    if not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise UserError(f"--out {out}: cannot write in {parent}")
-    return path
-
-
-def _is_report(path: Path) -> bool:
-    try:
-        return json.loads((path / RESULTS).read_text())["kind"] == KIND
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return False
-
-
 def main(argv: list[str] | None = None) -> None:
     """Command line."""
     from mcx_jax import startup
@@ -102,23 +69,8 @@ def main(argv: list[str] | None = None) -> None:
     from mcx_jax.report.build import build
 
     html, pngs, results = build(config, loaded, argv, say=lambda text: print(text, flush=True))
-    write(out, html, pngs, {"kind": KIND, **results})
+    write(out, html, pngs, results)
     print(f"done: {out / PAGE}")
-
-
-def write(out: Path, html: str, pngs: dict[str, bytes], results: dict[str, Any]) -> None:
-    """Write page, figures and results; an earlier report's figures that are no more go."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        for old in out.glob("*.png"):
-            old.unlink()
-        # First, so that a report cut short is known as one.
-        (out / RESULTS).write_text(json.dumps(results, indent=1) + "\n")
-        for name, data in pngs.items():
-            (out / f"{name}.png").write_bytes(data)
-        (out / PAGE).write_text(html, encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"--out {out}: cannot be written ({reason(error)})") from None
 
 
 if __name__ == "__main__":
