@@ -29,7 +29,7 @@ bench: $(VENV)/.run  ## how fast everything is here, rivals included; let nothin
 	$(PY) -m mcx_jax.bench $(ARGS)
 
 test: check  ## lint, format, types, then the tests but the slow ones, cheap ones first
-	$(PY) -m pytest -m "not slow" $(ARGS)
+	$(PY) -m pytest -m "not slow" -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-slow: $(VENV)/.dev  ## the slow ones: runs killed 24 times, own data and own arm from end to end
 	$(PY) -m pytest -m slow $(ARGS)
