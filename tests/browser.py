@@ -71,6 +71,21 @@ class Tab:
             "() => document.documentElement.scrollWidth - document.documentElement.clientWidth"
         )
 
+    def cut_off(self, selector: str = "body *") -> list[str]:
+        """What of the elements sticks out of the window, or has to be scrolled sideways."""
+        return self.page.evaluate(CUT_OFF, selector)
+
+
+CUT_OFF = """selector => {
+  const edge = document.documentElement.clientWidth + 1
+  const scrolls = e => ["auto", "scroll", "hidden"].includes(getComputedStyle(e).overflowX)
+  return [...document.querySelectorAll(selector)]
+    .filter(e => e.checkVisibility() && e.clientWidth + e.getBoundingClientRect().width > 0)
+    .filter(e => e.getBoundingClientRect().right > edge
+      || scrolls(e) && e.clientWidth && e.scrollWidth > e.clientWidth + 1)
+    .map(e => `${e.tagName} ${e.textContent.trim().slice(0, 60)}`)
+}"""
+
 
 @contextlib.contextmanager
 def tab(

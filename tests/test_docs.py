@@ -16,6 +16,7 @@ import subprocess
 import sys
 import typing
 
+import browser
 import pytest
 
 import mcx_jax
@@ -95,8 +96,11 @@ def parse(module, words):
     cli.parse(TrainCommand, words, prog=module, default=TrainCommand(train=config))
 
 
-def test_the_site_builds_without_a_warning_and_fetches_nothing(repo_root, pages, tmp_path):
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+@pytest.fixture(scope="module")
+def site(repo_root, tmp_path_factory):
+    """Folder of the built site, which builds without a warning."""
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
     done = subprocess.run(
         command,
         cwd=repo_root,
@@ -106,15 +110,39 @@ def test_the_site_builds_without_a_warning_and_fetches_nothing(repo_root, pages,
     )
     assert done.returncode == 0, done.stderr
     assert "WARNING" not in done.stderr, done.stderr
-    for page in pages:
-        html = (tmp_path / page).with_suffix(".html").read_text()
+    return folder
+
+
+def test_the_site_fetches_nothing(site, pages):
+    for page in (*pages, "readme.md"):
+        html = (site / page).with_suffix(".html").read_text()
         # What a browser loads by itself: scripts, styles, pictures, not the links of a text.
         loaded = re.findall(r"<(?:script|link|img|source|iframe)\b[^>]*(?:https?:)?//[^>]*>", html)
         assert not loaded, (page, loaded)
-    shown = (tmp_path / "api" / "task.html").read_text()
+    shown = (site / "api" / "task.html").read_text()
     assert 'id="mcx_jax.envs.lag.apply"' in shown
     assert "joint reference, rad" in shown  # units come with the arguments
-    assert not list(tmp_path.rglob("*.py"))
+    assert not list(site.rglob("*.py"))
+
+
+def test_the_site_from_disk_is_whole_in_a_browser(site, tmp_path):
+    """At 1280 px no table and no output is cut, numbers stay on one line; search finds."""
+    with browser.tab(tmp_path / "profile", 1280) as tab:
+        for page in ("index.html", "results.html", "commands.html"):
+            tab.page.goto((site / page).as_uri())
+            assert tab.cut_off("article :is(div, pre, code, table, img)") == [], page
+            assert tab.sideways_px() <= 0 and not browser.blank(tab.picture())
+        tab.page.goto((site / "results.html").as_uri())
+        heights = "cells => cells.map(cell => cell.getBoundingClientRect().height)"
+        rows = tab.page.locator("article table:first-of-type tbody td:nth-child(2)")
+        assert max(rows.evaluate_all(heights)[:5]) < 40, "0.90 / 0.93 takes two lines"
+        tab.page.goto((site / "index.html").as_uri())
+        tab.page.get_by_role("link", name="README", exact=True).click()
+        tab.page.wait_for_url("**/readme.html")
+        tab.page.locator("input[name=query]").click()
+        tab.page.keyboard.type("chatter")
+        tab.page.locator(".md-search-result__item").first.wait_for(timeout=20_000)
+    assert tab.complaints == []
 
 
 def test_every_module_is_on_one_api_page(pages):
