@@ -4,7 +4,6 @@ All in one run, rivals included; medians of five (training under --quick: three)
 apart.
 """
 
-import importlib.util
 import json
 import resource
 import sys
@@ -132,7 +131,7 @@ def peak_memory_gib() -> float:
 
 def main(argv: list[str] | None = None) -> None:
     """Command line."""
-    from mcx_jax import cli, startup
+    from mcx_jax import cli, extras, startup
 
     argv = list(sys.argv[1:] if argv is None else argv)
     config = cli.parse(BenchConfig, cli.optional_value(argv, "--json", "-"), prog="bench")
@@ -140,8 +139,8 @@ def main(argv: list[str] | None = None) -> None:
     cli.check_output("--plot", config.plot)
     if config.plot and Path(config.plot).suffix not in (".png", ".svg"):
         raise UserError(f"--plot {config.plot}: the name must end in .png or .svg")
-    if config.plot and importlib.util.find_spec("matplotlib") is None:
-        raise UserError("--plot needs matplotlib: install the 'viz' extra")
+    if config.plot:
+        extras.require("matplotlib", "--plot")
     report = sys.stderr if config.json == "-" else sys.stdout
 
     def say(line: str) -> None:
