@@ -210,3 +210,10 @@ def test_a_working_directory_that_is_gone_is_one_line(tmp_path, repo_root):
     )
     assert done.returncode == 2
     assert done.stderr == ("error: the working directory has been deleted; change to another one\n")
+
+
+def test_nothing_is_printed_on_the_way_to_mjx():
+    """MJX prints that warp is missing, in front of what `--json -` writes."""
+    code = "import mcx_jax.mjx_step, mcx_jax.envs.mjx_engine"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout == ""

@@ -69,7 +69,7 @@ def c_batch(envs: int) -> float:
 
 def mjx(envs: int) -> float:
     """Physics steps/s of MJX, without contact and constraint work."""
-    from mujoco import mjx as mj_x
+    from mcx_jax.quiet_mjx import mjx as mj_x
 
     model = load_mujoco("paper")
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
