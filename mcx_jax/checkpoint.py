@@ -1,8 +1,9 @@
 """Checkpoints of a training state: written whole or not at all, verified, restored exactly.
 
     checkpoints/ITERATION/state/          the arrays, by orbax
-    checkpoints/ITERATION/manifest.json   format, configuration, package versions, type and shape of
-                                          every array, SHA-256 of every file and of the manifest
+    checkpoints/ITERATION/manifest.json   format, configuration, package versions, XLA_FLAGS, type
+                                          and shape of every array, SHA-256 of every file
+                                          and of the manifest
 
 A checkpoint is made in `.ITERATION.partial` and gets its name by one rename when all of it, the
 manifest last, is on the disk. A state is stored as a flat dictionary {path of the leaf: array},
@@ -170,6 +171,7 @@ def _write_manifest(folder: Path, iteration: int, config: str, leaves: dict[str,
         "iteration": iteration,
         "config": config,
         "packages": _packages(),
+        "xla_flags": os.environ.get("XLA_FLAGS", ""),  # on them the bits depend
         "leaves": leaves,
         "files": {p.relative_to(folder).as_posix(): _digest(p) for p in files},
     }
