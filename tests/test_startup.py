@@ -8,7 +8,9 @@ import sys
 import pytest
 
 from mcx_jax import cli, machine, startup
+from mcx_jax.config import TrainConfig
 from mcx_jax.errors import UserError
+from mcx_jax.run_dir import RunDir
 from mcx_jax.startup import (
     DEVICES_FLAG,
     FUSION_FLAG,
@@ -164,6 +166,18 @@ def test_the_set_up_does_without_what_only_linux_has(monkeypatch):
     monkeypatch.setattr(startup.ctypes, "CDLL", no_library)
     monkeypatch.setattr(sys, "platform", "win32")
     startup.limit_heaps()
+
+
+def test_a_run_without_file_locks_is_refused_before_anything_is_written(tmp_path, monkeypatch):
+    """Windows has no fcntl."""
+    monkeypatch.setitem(sys.modules, "fcntl", None)
+    run = RunDir(tmp_path / "run", TrainConfig())
+    with (
+        pytest.raises(UserError, match="cannot lock a run's directory; train on Linux"),
+        run.held(),
+    ):
+        pass
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_cache_that_cannot_be_used_is_one_line(tmp_path, monkeypatch):
