@@ -154,22 +154,23 @@ def _use_cache(jax) -> list[str]:
 
 
 def _check_device(jax, device: str) -> None:
+    """Refuse a device that is asked for and not there; the CPU always is."""
+    names = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME")
+    asked = {name: os.environ[name] for name in names if os.environ.get(name)}
+    if device == "cpu" or (device == "auto" and set(asked.values()) <= {"cpu"}):
+        return
     try:
         jax.devices("gpu" if device == "gpu" else None)
-        return
-    except (AssertionError, RuntimeError) as error:
-        said = reason(error)
-    names = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME")
-    asked = " ".join(f"{name}={os.environ[name]}" for name in names if os.environ.get(name))
-    if device == "gpu":
-        hidden = f" ({asked} is set)" if asked else ""
+    except (AssertionError, RuntimeError):  # JAX 0.10 asserts where CUDA's plugin is missing
+        said = " ".join(f"{name}={value}" for name, value in asked.items())
+        if device == "gpu":
+            raise UserError(
+                f"--device gpu: JAX finds no GPU here{f' ({said} is set)' if said else ''}; use "
+                f"--device cpu, or on a machine with one: {extras.install('cuda')}"
+            ) from None
         raise UserError(
-            f"--device gpu: JAX finds no GPU here{hidden}; use --device cpu, or on a machine with "
-            f"one: {extras.install('cuda')}"
-        )
-    if asked:
-        raise UserError(f"{asked}: JAX finds no such device here; unset it, or use --device cpu")
-    raise UserError(f"JAX finds no device ({said}); use --device cpu")
+            f"{said}: JAX finds no such device here; unset it, or use --device cpu"
+        ) from None
 
 
 def run_command(main: Callable[[], None]) -> None:

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from mcx_jax import cli, machine, startup
+from mcx_jax import cli, extras, machine, startup
 from mcx_jax.config import TrainConfig
 from mcx_jax.errors import UserError
 from mcx_jax.run_dir import RunDir
@@ -102,6 +102,32 @@ def test_processes_meet_before_jax_looks_for_devices(monkeypatch):
     monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))
     startup.configure("gpu", cores=1, distributed="auto")
     assert order == ["auto", "devices"]
+
+
+class NoGpu:
+    """A JAX that has a CPU alone."""
+
+    def devices(self, kind):
+        if kind == "gpu" or os.environ.get("JAX_PLATFORM_NAME") == "gpu":
+            raise RuntimeError("Unknown backend")
+
+
+def test_a_device_that_is_not_there_is_one_line_and_the_cpu_is_not_asked_for(monkeypatch):
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    monkeypatch.delenv("JAX_PLATFORM_NAME", raising=False)
+    startup._check_device(None, "cpu")  # JAX would look for its devices, too early for `hosts.join`
+    startup._check_device(None, "auto")
+    install = extras.install("cuda")
+    with pytest.raises(UserError) as error:
+        startup._check_device(NoGpu(), "gpu")
+    assert str(error.value) == (
+        "--device gpu: JAX finds no GPU here (JAX_PLATFORMS=cpu is set); use --device cpu, or on "
+        f"a machine with one: {install}"
+    )
+    monkeypatch.setenv("JAX_PLATFORMS", "")
+    monkeypatch.setenv("JAX_PLATFORM_NAME", "gpu")
+    with pytest.raises(UserError, match="^JAX_PLATFORM_NAME=gpu: JAX finds no such device here"):
+        startup._check_device(NoGpu(), "auto")
 
 
 def files(root, **contents):
