@@ -27,6 +27,8 @@ def main() -> None:
     rows += [("environment", r["envs"], r["steps_per_s"]) for r in figures["environment"]]
     rows += [(f"part {name} us", "", us) for name, us in figures["breakdown_us"].items()]
     rows += [(name, "", value) for name, value in figures["ratio"].items()]
+    for name, (least, most) in figures.get("ratio_range", {}).items():  # not in older files
+        rows += [(f"{name} least", "", least), (f"{name} most", "", most)]
     rows += [(f"compile {name} s", "", value) for name, value in figures["compile_s"].items()]
     single = (
         "gradient_over_forward",

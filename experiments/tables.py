@@ -381,6 +381,11 @@ def speed() -> str:
         envs = max(cells, key=lambda n: cells[n])
         return f"{cells[envs] / 1e6:.2f} M/s ({envs} environments)"
 
+    def times(name: str) -> str:
+        ends = [one.get(f"{name} {end}", one[name]) for end in ("least", "most")]
+        least, most = (f"{x:.0f}" for x in ends)
+        return f"{least} times" if least == most else f"{least} to {most} times"
+
     parts = [f"{name[5:-3]} {us:.2f}" for name, us in one.items() if name.startswith("part ")]
     environment = [f"{v / 1e3:.0f} k/s ({n})" for (w, n), v in at.items() if w == "environment"]
     share, rate = one["learner_matmul_share"], one["matmul_gflops"]
@@ -389,8 +394,8 @@ def speed() -> str:
         ["C MuJoCo, `mujoco.batch`, all cores", best("c-batch")],
         ["C MuJoCo, `mujoco.rollout`, all cores", best("c-rollout")],
         ["MJX, its CPU flag set", best("mjx")],
-        ["chain over C, each at its best batch", f"{one['chain_over_c']:.0f} times"],
-        ["chain over MJX, 2048 environments", f"{one['chain_over_mjx']:.0f} times"],
+        ["chain over C, each at its best batch", times("chain_over_c")],
+        ["chain over MJX, 2048 environments", times("chain_over_mjx")],
         ["gradient of ten steps over the steps", f"{one['gradient_over_forward']:.1f} times"],
         ["environment, control steps of 20 ms", ", ".join(environment)],
         ["its parts alone, us a control step", ", ".join(parts)],

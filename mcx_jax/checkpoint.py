@@ -1,8 +1,9 @@
 """Checkpoints of a training state: written whole or not at all, verified, restored exactly.
 
     checkpoints/ITERATION/state/          the arrays, by orbax
-    checkpoints/ITERATION/manifest.json   format, configuration, package versions, type and shape of
-                                          every array, SHA-256 of every file and of the manifest
+    checkpoints/ITERATION/manifest.json   format, configuration, package versions, XLA_FLAGS, type
+                                          and shape of every array, SHA-256 of every file
+                                          and of the manifest
 
 A checkpoint is made in `.ITERATION.partial` and gets its name by one rename when all of it, the
 manifest last, is on the disk. A state is stored as a flat dictionary {path of the leaf: array},
@@ -22,8 +23,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from mcx_jax import hosts
@@ -153,6 +152,8 @@ def set_aside_after(run_dir: Path, iteration: int) -> None:
 
 def flatten(tree: Any) -> dict[str, Any]:
     """{path: array or its shape}, keys as raw data, nothing without elements."""
+    import jax
+
     leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     flat = {jax.tree_util.keystr(path): _raw(leaf) for path, leaf in leaves}
     return {path: leaf for path, leaf in flat.items() if leaf.size}
@@ -170,6 +171,7 @@ def _write_manifest(folder: Path, iteration: int, config: str, leaves: dict[str,
         "iteration": iteration,
         "config": config,
         "packages": _packages(),
+        "xla_flags": os.environ.get("XLA_FLAGS", ""),  # on them the bits depend
         "leaves": leaves,
         "files": {p.relative_to(folder).as_posix(): _digest(p) for p in files},
     }
@@ -296,6 +298,8 @@ def _orbax() -> Any:
 
 def _checkpointer(ocp: Any) -> Any:
     """A writer and reader that waits for no other process."""
+    import jax
+
     me = jax.process_index()
     options = ocp.options.MultiprocessingOptions(primary_host=me, active_processes={me})
     return ocp.Checkpointer(ocp.StandardCheckpointHandler(), multiprocessing_options=options)
@@ -309,10 +313,14 @@ def _unraisable(what: Any) -> None:
 
 
 def _is_key(leaf: Any) -> bool:
-    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+    import jax
+
+    return jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def _raw(leaf: Any) -> Any:
+    import jax
+
     if not isinstance(leaf, jax.ShapeDtypeStruct):
         return jax.random.key_data(leaf) if _is_key(leaf) else leaf
     if not _is_key(leaf):
@@ -322,17 +330,21 @@ def _raw(leaf: Any) -> Any:
     return jax.ShapeDtypeStruct(raw.shape, raw.dtype, sharding=sharding)
 
 
-def _laid_out(stored: np.ndarray, like: Any) -> jax.Array:
+def _laid_out(stored: np.ndarray, like: Any) -> Any:
     """A stored array where its model lies."""
+    import jax
+
     sharding = like.sharding or jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
     return jax.make_array_from_callback(stored.shape, sharding, lambda part: stored[part])
 
 
 def _unflatten(like: Any, flat: dict[str, Any]) -> Any:
+    import jax
+
     def leaf_of(path: Any, leaf: Any) -> Any:
         stored = flat.get(jax.tree_util.keystr(path))
         if stored is None:
-            return jnp.zeros(leaf.shape, leaf.dtype)
+            return jax.numpy.zeros(leaf.shape, leaf.dtype)
         return jax.random.wrap_key_data(stored) if _is_key(leaf) else stored
 
     return jax.tree_util.tree_map_with_path(leaf_of, like)

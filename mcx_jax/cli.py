@@ -40,6 +40,7 @@ def parse(
     """
     kwargs: dict[str, Any] = {} if default is None else {"default": default}
     said = io.StringIO()
+    _check_names(argv)
     try:
         with contextlib.redirect_stderr(said):
             return tyro.cli(
@@ -53,6 +54,20 @@ def parse(
         if stop.code in (0, None):  # --help
             raise
         raise UserError(_one_line(said.getvalue())) from None
+
+
+def _check_names(argv: Sequence[str]) -> None:
+    """Checkpoints, JSON and the terminal take no name that is not text; every relative name needs
+    a working directory."""
+    try:
+        here = os.getcwd()
+    except FileNotFoundError:
+        raise UserError("the working directory has been deleted; change to another one") from None
+    for name in (*argv, here):
+        try:
+            name.encode()
+        except UnicodeEncodeError:
+            raise UserError(f"{name}: is not UTF-8; use a name that is") from None
 
 
 def _one_line(box: str) -> str:

@@ -15,7 +15,6 @@ with the normalisation inside; the interface (`mcx_jax.interface`) is printed.
   on, not to archive.
 """
 
-import importlib.util
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +22,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from mcx_jax import cli
+from mcx_jax import cli, extras
 from mcx_jax.errors import UserError, reason
 
 if TYPE_CHECKING:
@@ -54,8 +53,8 @@ class ExportConfig:
             raise UserError(f"--out {self.out}: exists already; name another file, or remove it")
         if not path.absolute().parent.is_dir():
             raise UserError(f"--out {self.out}: no such directory")
-        if path.suffix == ".onnx" and importlib.util.find_spec("onnx") is None:
-            raise UserError(f"--out {self.out}: needs the package onnx; install the 'export' extra")
+        if path.suffix == ".onnx":
+            extras.require("onnx", f"--out {self.out}")
 
 
 def export(policy: "Policy", path: Path) -> None:

@@ -24,7 +24,12 @@ from collections.abc import Sequence
 from functools import cache, partial
 from typing import Any, Literal, get_type_hints
 
-import gymnasium
+try:
+    import gymnasium
+except ModuleNotFoundError as error:
+    from mcx_jax import extras
+
+    raise ModuleNotFoundError(extras.missing("gymnasium", "mcx_jax.gym")) from error
 import jax
 import jax.numpy as jnp
 import numpy as np

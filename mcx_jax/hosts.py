@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from mcx_jax import heartbeat
 from mcx_jax.errors import UserError, reason
 
 PLACE = re.compile(r"(?P<coordinator>[^,\s]+:(?P<port>\d+)),(?P<index>\d+)/(?P<count>\d+)")
@@ -23,6 +24,11 @@ BROKEN = re.compile("Gloo|NCCL|UNAVAILABLE|[Cc]onnection|heartbeat")
 """What JAX's errors say when another process has gone (on a CPU they are ValueErrors)."""
 WAIT_S = 120
 """For the other processes to begin."""
+SILENCE_S = heartbeat.SILENCE_S
+"""After which a process that says nothing is given up."""
+
+_beats: list[heartbeat.Heartbeat] = []
+"""This process's, while it works with others."""
 
 
 def check(text: str) -> None:
@@ -54,8 +60,9 @@ def join(text: str) -> None:
     try:
         if place := PLACE.fullmatch(text):
             coordinator, count, index = place["coordinator"], place["count"], place["index"]
-            meet(coordinator, int(count), int(index), WAIT_S)
+            partners = meet(coordinator, int(count), int(index), WAIT_S)
             jax.distributed.initialize(coordinator, int(count), int(index))
+            _beats.append(heartbeat.Heartbeat(partners, _lost, heartbeat.BEAT_S, SILENCE_S))
         else:
             jax.distributed.initialize()
     except (OSError, RuntimeError, ValueError) as error:
@@ -65,44 +72,76 @@ def join(text: str) -> None:
         contextlib.redirect_stdout(open(os.devnull, "w")).__enter__()  # for good
 
 
-def meet(coordinator: str, count: int, index: int, wait_s: float) -> None:
+def meet(coordinator: str, count: int, index: int, wait_s: float) -> dict[int, socket.socket]:
     """Return when all processes have come, on the port that JAX will use: it would abort the
     process, with a stack, where one is missing.
+
+    Returns:
+        {index of a process: connection to it}: process 0 has all others, these have process 0.
 
     Raises:
         OSError: they have not all come in time, or the port cannot be used.
     """
-    host, _, port = coordinator.rpartition(":")
     until = time.monotonic() + wait_s
-    if index:
-        while True:
-            try:
-                with socket.create_connection((host.strip("[]"), int(port)), wait_s) as server:
-                    server.settimeout(max(until - time.monotonic(), 0.1))
-                    if server.recv(1):
-                        return
-                raise OSError(f"process 0 at {coordinator} has given up")
-            except ConnectionError:  # it is not there yet
-                if time.monotonic() > until:
-                    raise OSError(f"nobody listens at {coordinator} after {wait_s:g} s") from None
-                time.sleep(0.2)
+    host, _, port = coordinator.rpartition(":")
+    if not index:
+        return _wait_for(int(port), count, until, wait_s)
+    while True:
+        try:
+            return {0: _come_to((host.strip("[]"), int(port)), index, until, wait_s)}
+        except ConnectionError:  # it is not there yet
+            if time.monotonic() > until:
+                raise OSError(f"nobody listens at {coordinator} after {wait_s:g} s") from None
+            time.sleep(0.2)
+        except EOFError:
+            raise OSError(f"process 0 at {coordinator} has given up") from None
+
+
+def _come_to(place: tuple[str, int], index: int, until: float, wait_s: float) -> socket.socket:
     with contextlib.ExitStack() as stack:
-        both = socket.has_dualstack_ipv6()
-        family = socket.AF_INET6 if both else socket.AF_INET
-        server = stack.enter_context(
-            socket.create_server(("", int(port)), family=family, dualstack_ipv6=both)
-        )
-        come: list[socket.socket] = []
+        server = stack.enter_context(socket.create_connection(place, wait_s))
+        server.settimeout(max(until - time.monotonic(), 0.1))
+        server.sendall(index.to_bytes(4, "big"))
+        if not server.recv(1):
+            raise EOFError
+        stack.pop_all()  # it stays open
+        return server
+
+
+def _wait_for(port: int, count: int, until: float, wait_s: float) -> dict[int, socket.socket]:
+    both = socket.has_dualstack_ipv6()
+    family = socket.AF_INET6 if both else socket.AF_INET
+    come: dict[int, socket.socket] = {}
+    with (
+        contextlib.ExitStack() as stack,
+        socket.create_server(("", port), family=family, dualstack_ipv6=both) as server,
+    ):
         while len(come) < count - 1:
-            server.settimeout(max(until - time.monotonic(), 0.01))
             try:
-                come.append(stack.enter_context(server.accept()[0]))
+                server.settimeout(max(until - time.monotonic(), 0.01))
+                other = stack.enter_context(server.accept()[0])
+                other.settimeout(max(until - time.monotonic(), 0.01))
+                index = int.from_bytes(other.recv(4), "big")
             except TimeoutError:
                 missing = count - 1 - len(come)
                 raise OSError(f"{missing} of {count} are missing after {wait_s:g} s") from None
-        server.close()
-        for other in come:
+            if 0 < index < count:
+                come[index] = other
+            else:
+                other.close()  # a stranger
+        for other in come.values():
             other.sendall(b"1")
+        stack.pop_all()  # they stay open
+    return come
+
+
+def _lost(what: str) -> None:
+    """End this process: its main thread waits for the others in compiled code, for ever."""
+    import jax
+
+    me = f"process {jax.process_index()} of {jax.process_count()}"
+    print(f"error: {me} {what}; start all again with --resume", file=sys.stderr, flush=True)
+    os._exit(2)
 
 
 def first() -> bool:
@@ -173,4 +212,6 @@ def part() -> None:
     import jax
 
     if not alone():
-        jax.distributed.shutdown()
+        jax.distributed.shutdown()  # which waits for all: until then a heart has to beat
+        while _beats:
+            _beats.pop().stop()

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from mujoco import mjx
 
 from mcx_jax.envs.model import ChainModel, Link, refuse_unsupported
+from mcx_jax.quiet_mjx import mjx
 from mcx_jax.spatial import (
     EYE,
     ZERO,

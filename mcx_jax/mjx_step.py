@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from mujoco import mjx
 
 from mcx_jax.envs import dynamics
 from mcx_jax.mjx_model import Arm, compose, read
+from mcx_jax.quiet_mjx import mjx
 from mcx_jax.spatial import (
     EYE,
     ZERO,

@@ -6,7 +6,6 @@ exactly (docs/trust.md). Needs no JAX device, so that a mistake is told at once.
 """
 
 import contextlib
-import fcntl
 import json
 import math
 import os
@@ -49,6 +48,13 @@ class RunDir:
         if not self.writes:
             yield
             return
+        try:
+            import fcntl
+        except ImportError:
+            raise UserError(
+                f"{self.path}: this system cannot lock a run's directory; train on Linux or macOS, "
+                "or in the Windows Subsystem for Linux"
+            ) from None
         with writing(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
             file = (self.path / LOCK).open("a")

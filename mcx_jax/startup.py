@@ -6,12 +6,14 @@ Nothing here runs on import of the library; a command calls `run_command(main)` 
 import ctypes
 import os
 import sys
+import tempfile
+import warnings
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
-from mcx_jax import hosts
-from mcx_jax.errors import UserError
+from mcx_jax import extras, hosts, jax_settings, machine
+from mcx_jax.errors import UserError, reason
 
 FUSION_FLAG = "--xla_cpu_use_fusion_emitters"
 """From jaxlib 0.8 to 0.11.1 the default CPU fusion emitters run MJX 100-300 times slower than the
@@ -33,8 +35,8 @@ def limit_heaps(count: int = 2) -> None:
     A heap for every thread is the default, and a checkpoint is written by dozens of them: the
     holes that they leave made a training run grow for twenty minutes.
     """
-    tunables = os.environ.get("GLIBC_TUNABLES", "")
-    if "MALLOC_ARENA_MAX" not in os.environ and "arena_max" not in tunables:
+    said = "MALLOC_ARENA_MAX" in os.environ or "arena_max" in os.environ.get("GLIBC_TUNABLES", "")
+    if sys.platform == "linux" and not said:
         set_option = getattr(ctypes.CDLL(None), "mallopt", None)
         if set_option:
             set_option(M_ARENA_MAX, count)
@@ -74,8 +76,8 @@ def cache_dir() -> Path:
 def configure(
     device: str = "auto", *, mjx: bool = False, cores: int | None = None, distributed: str = ""
 ) -> list[str]:
-    """Set XLA flags, the compilation cache, matmul precision and, without a word, the number of
-    heaps (`limit_heaps`); call before any JAX computation.
+    """Set up JAX: its settings (`jax_settings`), XLA flags, the compilation cache, float32 matrix
+    products, the number of heaps (`limit_heaps`); call before JAX is imported.
 
     Args:
         device: "auto", "cpu" or "gpu".
@@ -84,41 +86,90 @@ def configure(
         distributed: the other processes of this run (`mcx_jax.hosts.join`).
 
     Returns:
-        One line for each thing that was set, for the user to read.
+        What the user has to know: a line for each thing that is otherwise than usual.
 
     Raises:
-        UserError: a GPU was asked for and JAX finds none; the other processes do not come.
+        UserError: JAX finds no device of the kind asked for, or cannot run with a variable of the
+            environment; the other processes do not come.
     """
+    said = jax_settings.clean(known_flags(version("jaxlib")))
     limit_heaps()
-    said = []
-    cores = len(os.sched_getaffinity(0)) if cores is None else cores
+    if "JAX_NUM_CPU_DEVICES" in os.environ:
+        cores = 1  # the user's word stands
+    _set_xla_flags(machine.cores() if cores is None else cores, mjx)
+    if device == "cpu":
+        os.environ["JAX_PLATFORMS"] = "cpu"
+        os.environ.pop("JAX_PLATFORM_NAME", None)
+    try:
+        import jax
+    except ValueError as error:
+        raise UserError(f"JAX does not start: {reason(error)}; change or unset it") from None
+
+    # TF32 would round the policy's inputs to 10 bits: 1 mm in 1 m, the size of the errors here.
+    jax.config.update("jax_default_matmul_precision", "float32")
+    said += _use_cache(jax)
+    hosts.join(distributed)  # which JAX allows only before it has looked for devices
+    _check_device(jax, device)
+    return said
+
+
+def known_flags(jaxlib_version: str) -> str:
+    """Pattern of the XLA flags that this project sets itself, with values that XLA reads."""
+    known = [
+        rf"{DEVICES_FLAG}=\d+",
+        rf"{PASSES_FLAG}=[\w,-]*",
+        r"--xla_backend_optimization_level=\d",
+    ]
+    if needs_old_emitters(jaxlib_version):
+        known.append(f"{FUSION_FLAG}=(true|false)")
+    return "|".join(known)
+
+
+def _set_xla_flags(cores: int, mjx: bool) -> None:
     current = os.environ.get("XLA_FLAGS", "")
     flags = xla_flags_for(version("jaxlib"), current, cores=cores, mjx=mjx)
     if flags != current:
         os.environ["XLA_FLAGS"] = flags
-        said.append(f"XLA_FLAGS += {flags.removeprefix(current).strip()}")
-    if device == "cpu":
-        os.environ["JAX_PLATFORMS"] = "cpu"
-    import jax
-
-    # TF32 would round the policy's inputs to 10 bits: 1 mm in 1 m, the size of the errors here.
-    jax.config.update("jax_default_matmul_precision", "float32")
-    if os.environ.get("MCX_JAX_CACHE") != "":
-        jax.config.update("jax_compilation_cache_dir", str(cache_dir()))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
-    hosts.join(distributed)  # which JAX allows only before it has looked for devices
-    if device == "gpu":
-        _require_gpu(jax)
-    return said
 
 
-def _require_gpu(jax) -> None:
+def _use_cache(jax) -> list[str]:
+    """Let JAX keep compiled programs; a line for the user where it cannot."""
+    if os.environ.get("MCX_JAX_CACHE") == "":
+        return []
+    path = ""
     try:
-        jax.devices("gpu")
-    except RuntimeError:
+        path = cache_dir()
+        path.mkdir(parents=True, exist_ok=True)
+        with os.scandir(path) as entries, tempfile.TemporaryFile(dir=path) as file:
+            next(entries, None)
+            file.write(b"1")
+    except (OSError, RuntimeError, ValueError) as error:  # RuntimeError: nobody's home
+        said = f"the cache of compiled programs {path} cannot be used ({reason(error)})"
+        return [f"{said}: every start compiles; MCX_JAX_CACHE=DIR names another directory"]
+    jax.config.update("jax_compilation_cache_dir", str(path))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    # Of one entry that cannot be read or written: it is compiled instead.
+    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
+    return []
+
+
+def _check_device(jax, device: str) -> None:
+    """Refuse a device that is asked for and not there; the CPU always is."""
+    names = ("JAX_PLATFORMS", "JAX_PLATFORM_NAME")
+    asked = {name: os.environ[name] for name in names if os.environ.get(name)}
+    if device == "cpu" or (device == "auto" and set(asked.values()) <= {"cpu"}):
+        return
+    try:
+        jax.devices("gpu" if device == "gpu" else None)
+    except (AssertionError, RuntimeError):  # JAX 0.10 asserts where CUDA's plugin is missing
+        said = " ".join(f"{name}={value}" for name, value in asked.items())
+        if device == "gpu":
+            raise UserError(
+                f"--device gpu: JAX finds no GPU here{f' ({said} is set)' if said else ''}; use "
+                f"--device cpu, or on a machine with one: {extras.install('cuda')}"
+            ) from None
         raise UserError(
-            "--device gpu: JAX finds no GPU here; install the 'cuda' extra on a machine with one, "
-            "or use --device cpu"
+            f"{said}: JAX finds no such device here; unset it, or use --device cpu"
         ) from None
 
 

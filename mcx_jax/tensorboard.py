@@ -1,17 +1,15 @@
 """Event files for TensorBoard beside metrics.jsonl (`train --tensorboard`; extra `viz`)."""
 
-import importlib.util
 from pathlib import Path
 from typing import Any, Self
 
+from mcx_jax import extras
 from mcx_jax.config import TrainConfig
-from mcx_jax.errors import UserError
 
 
 def require() -> None:
     """Refuse, before anything is computed, where the package is missing."""
-    if importlib.util.find_spec("tensorboardX") is None:
-        raise UserError("--tensorboard needs tensorboardX: install the 'viz' extra or leave it out")
+    extras.require("tensorboardX", "--tensorboard")
 
 
 class EventFile:

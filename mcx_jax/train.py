@@ -169,9 +169,9 @@ def compile_quickly() -> str:
     """Set `QUICK_COMPILE` unless the user has set a level; returns what to tell the user."""
     flags = os.environ.get("XLA_FLAGS", "")
     if "xla_backend_optimization_level" in flags:
-        return "XLA_FLAGS: optimisation level as set by you"
+        return "smoke run: compiled at the optimisation level that XLA_FLAGS names"
     os.environ["XLA_FLAGS"] = f"{flags} {QUICK_COMPILE}".strip()
-    return f"XLA_FLAGS += {QUICK_COMPILE} (a smoke run: its speed means nothing)"
+    return "smoke run: compiled without optimisation, so that its speed means nothing"
 
 
 def main(argv: list[str] | None = None) -> None:

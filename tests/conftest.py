@@ -29,7 +29,7 @@ except ImportError as error:  # a broken start-up module must fail its own tests
     START_UP = [f"mcx_jax.startup is missing: {error}"]
 else:
     # One device, as a library user has it; tests of several start processes of their own.
-    START_UP = configure(mjx=True, cores=1)
+    START_UP = [*configure(mjx=True, cores=1), f"XLA_FLAGS={os.environ.get('XLA_FLAGS', '')}"]
 
 CHEAP = (
     "test_assets",

@@ -20,6 +20,8 @@ CONTRACT = {
     "versions",
     "physics",
     "ratio",
+    "ratio_range",
+    "xla_flags",
     "environment_steps_per_s",
     "rollout_steps_per_s",
     "training_steps_per_s",
@@ -35,8 +37,32 @@ ROWS = [
 ]
 
 
-def test_ratios_take_the_best_batch_against_c_and_the_same_batch_against_mjx():
-    assert bench.ratios(ROWS) == {"chain_over_c": 20.0, "chain_over_mjx": 60.0}
+def test_rivals_are_the_best_batches_of_chain_and_c_and_the_same_batch_of_mjx():
+    assert bench.rivals(ROWS) == {
+        "chain_over_c": (("chain", 16384), ("c-batch", 2048)),
+        "chain_over_mjx": (("chain", 2048), ("mjx", 2048)),
+    }
+
+
+def test_a_ratio_is_measured_in_turn_and_as_often_as_asked(monkeypatch):
+    """Ours takes 10 steps a call and theirs 1; seconds as listed."""
+    seconds, order = iter([1.0, 2.0, 1.0, 5.0, 2.0, 1.0]), []
+
+    def timed(call, repeats):
+        order.append(call())
+        return next(seconds)
+
+    monkeypatch.setattr(physics, "median_s", timed)
+    ours, theirs = physics.Work(lambda: "ours", 10), physics.Work(lambda: "theirs", 1)
+    assert physics.ratios(ours, theirs, 3) == [20.0, 50.0, 5.0]
+    assert order == ["ours", "theirs"] * 3
+
+
+def test_the_matrix_rate_is_the_best_of_all_repeats_shapes_and_devices(monkeypatch):
+    """Of 2 s and 1 s, and of the larger product, of 2 * 8^3 operations."""
+    monkeypatch.setattr(program, "SHAPES", ((4, 4, 4), (8, 8, 8)))
+    monkeypatch.setattr(program, "samples_s", lambda call, repeats: [2.0, 1.0])
+    assert program.matmul_gflops() == pytest.approx(1e-9 * 2 * 8**3)
 
 
 def test_learner_flops_are_those_that_xla_counts():
@@ -70,12 +96,16 @@ def test_every_engine_takes_the_same_start():
 def test_engines_run(engine, monkeypatch):
     monkeypatch.setattr(timing, "MIN_S", 0.0)
     monkeypatch.setattr(physics, "LARGE_STEPS", 1)
-    assert physics.ENGINES[engine](2) > 0
+    assert physics.ENGINES[engine](2).steps_per_s(1) > 0
 
 
-def test_quick_writes_the_contract(monkeypatch, tmp_path):
-    speed = program.TrainingSpeed(1.0, 2.0, 3.0, 50.0)
-    engines = {name: lambda _: 1e6 for name in ("c-rollout", "c-batch", "mjx", "chain")}
+@pytest.mark.parametrize(("learner", "share"), [(50.0, 0.5), (125.0, 1.0)])
+def test_quick_writes_the_contract(learner, share, monkeypatch, tmp_path):
+    speed = program.TrainingSpeed(1.0, 2.0, 3.0, learner)
+    monkeypatch.setattr(physics.Work, "steps_per_s", lambda self, _: self.steps)
+    engines = {
+        name: lambda _: physics.Work(print, 10) for name in ("c-rollout", "c-batch", "mjx", "chain")
+    }
     monkeypatch.setattr(physics, "ENGINES", engines)
     monkeypatch.setattr(program, "environment_us", lambda *_: 5.0)
     monkeypatch.setattr(program, "training_speed", lambda *_: speed)
@@ -86,7 +116,8 @@ def test_quick_writes_the_contract(monkeypatch, tmp_path):
     figures = json.loads(out.read_text())
     assert set(figures) >= CONTRACT
     assert figures["environment_steps_per_s"] == 2e5
-    assert figures["learner_matmul_share"] == 0.5
+    assert figures["learner_matmul_share"] == share  # never above 1
+    assert figures["ratio_range"]["chain_over_c"] == [1.0, 1.0]
     assert {row["engine"] for row in figures["physics"]} == set(engines)
     assert plot.stat().st_size > 10_000
 

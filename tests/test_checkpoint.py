@@ -53,8 +53,10 @@ def _same(a, b):
         np.testing.assert_array_equal(x, y)
 
 
-def test_restored_exactly(tmp_path):
+def test_restored_exactly(tmp_path, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--these")
     checkpoint.save(tmp_path, 3, _state(1))
+    assert checkpoint.check(tmp_path, 3)["xla_flags"] == "--these"
     _same(checkpoint.restore(tmp_path, _state(2)), _state(1))
     shapes = jax.eval_shape(_state)
     _same(checkpoint.restore(tmp_path, shapes), _state(1))

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mcx_jax import cli, numpy_policy
+from mcx_jax import cli, extras, numpy_policy
 from mcx_jax.config import TrainConfig
 from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.envs import observe
@@ -332,9 +332,7 @@ def test_without_onnx_is_told(run_dir, tmp_path, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(Exception) as error:
         main([str(run_dir), "--out", str(tmp_path / "p.onnx")])
-    assert str(error.value) == (
-        f"--out {tmp_path}/p.onnx: needs the package onnx; install the 'export' extra"
-    )
+    assert str(error.value) == (f"--out {tmp_path}/p.onnx needs onnx: {extras.install('export')}")
 
 
 @pytest.mark.parametrize("form", ["npz", "onnx", "stablehlo"])

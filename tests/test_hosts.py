@@ -1,7 +1,9 @@
 """One run over two processes here: the same numbers, a common stop, the death of a partner."""
 
+import contextlib
 import json
 import os
+import queue
 import signal
 import socket
 import subprocess
@@ -15,6 +17,7 @@ import pytest
 
 from mcx_jax import hosts
 from mcx_jax.errors import UserError
+from mcx_jax.heartbeat import Heartbeat
 from mcx_jax.sharding import env_mesh
 
 ITERATIONS = 100
@@ -152,12 +155,67 @@ def test_partners_that_come_late():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         place = f"127.0.0.1:{free.getsockname()[1]}"
-    with ThreadPoolExecutor(3) as pool:
+    with ThreadPoolExecutor(3) as pool, contextlib.ExitStack() as stack:
         others = [pool.submit(hosts.meet, place, 3, i, 20.0) for i in (1, 2)]
         time.sleep(0.5)
-        hosts.meet(place, 3, 0, 20.0)
-        for other in others:
-            other.result()
+        met = hosts.meet(place, 3, 0, 20.0)
+        assert set(met) == {1, 2}
+        for index, other in zip((1, 2), others, strict=True):
+            (to_first,) = other.result().values()
+            stack.enter_context(to_first)
+            to_first.sendall(b"%d" % index)
+            assert stack.enter_context(met[index]).recv(1) == b"%d" % index
+
+
+BEAT_S, SILENCE_S = 0.02, 0.5
+"""Silence in tests: 25 beats, so that a busy machine does not make one up."""
+
+
+def hearts(*pairs):
+    """A heartbeat for {index: socket} each; (words of those lost, heartbeats)."""
+    said = [queue.Queue() for _ in pairs]
+    beats = [
+        Heartbeat(partners, words.put, BEAT_S, SILENCE_S)
+        for partners, words in zip(pairs, said, strict=True)
+    ]
+    return said, beats
+
+
+def test_a_process_that_falls_silent_ends_all_others():
+    """Three processes; the third is alive, its connection open, and says nothing."""
+    (to_1, from_0), (to_2, silent) = socket.socketpair(), socket.socketpair()
+    with silent:
+        said, beats = hearts({1: to_1, 2: to_2}, {0: from_0})
+        assert said[0].get(timeout=20) == "has heard nothing of process 2 for 0.5 s"
+        assert said[1].get(timeout=20) == "was told that another one is stopped or out of reach"
+        for beat in beats:
+            beat.stop()
+
+
+def test_processes_that_speak_or_part_are_not_given_up():
+    to_1, from_0 = socket.socketpair()
+    said, beats = hearts({1: to_1}, {0: from_0})
+    time.sleep(2 * SILENCE_S)
+    beats[0].stop()
+    time.sleep(2 * SILENCE_S)
+    beats[1].stop()
+    assert all(words.empty() for words in said)
+
+
+@pytest.mark.slow
+def test_a_stopped_process_ends_the_run_in_one_line(pair, place, monkeypatch):
+    """SIGSTOP: the process is alive and its connections are open."""
+    monkeypatch.setitem(place[1], "SILENCE_S", "10")
+    both = pair("stopped", signal.SIGSTOP, 3)
+    _, error = both[0].communicate(timeout=LIMIT_S)
+    assert both[0].returncode == 2
+    assert error.splitlines()[-1] == (
+        "error: process 0 of 2 has heard nothing of process 1 for 10 s; start all again with "
+        "--resume"
+    )
+    both[1].send_signal(signal.SIGCONT)
+    _, error = both[1].communicate(timeout=LIMIT_S)
+    assert both[1].returncode == 2 and "Traceback" not in error
 
 
 def test_auto_needs_a_cluster(repo_root, place):

@@ -107,7 +107,7 @@ def test_a_file_system_without_locks(tmp_path, monkeypatch):
     def refuse(*args):
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
-    monkeypatch.setattr("mcx_jax.run_dir.fcntl.flock", refuse)
+    monkeypatch.setattr("fcntl.flock", refuse)
     with pytest.raises(UserError, match=r"cannot lock files \(No locks available\); name a"):
         train(open_new(tmp_path / "run", CONFIG), _make_env)
 

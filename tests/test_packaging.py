@@ -14,6 +14,10 @@ import zipfile
 import pytest
 from packaging.requirements import Requirement
 
+import mcx_jax
+from mcx_jax import __main__ as commands
+from mcx_jax.errors import UserError
+
 # Put together here, so that this file does not contain what it looks for.
 FORBIDDEN = (
     r"(?<![\w.>)])/" + r"(work|root|home|Users)/",
@@ -133,6 +137,41 @@ def test_ci_installs_what_is_missing_or_says_so(repo_root, tmp_path):
         (tools / name).write_text(f"#!/bin/sh\n{text}\n")
         (tools / name).chmod(0o755)
     assert call(env={"PATH": str(tools), "APT": "100"}).returncode == 0
+
+
+def test_the_version_is_that_of_the_package():
+    """`import mcx_jax` alone: quick, and without anything that is installed."""
+    code = "import sys, mcx_jax; print(mcx_jax.__version__, len(sys.modules) < 100)"
+    said = run(sys.executable, "-S", "-c", code, cwd=mcx_jax.__path__[0] + "/..")
+    assert said.split() == [importlib.metadata.version("mcx_jax"), "True"]
+
+
+def test_python_m_mcx_jax_lists_every_command(repo_root, tracked, capsys):
+    package = repo_root / "mcx_jax"
+    runs = [p.relative_to(package) for p in tracked if package in p.parents and p.suffix == ".py"]
+    runs = [p for p in runs if "run_command(main)" in (package / p).read_text()]
+    names = {str(p).removesuffix("/__main__.py").removesuffix(".py") for p in runs}
+    commands.main([])
+    said = capsys.readouterr().out
+    assert names - {"__main__", "startup"} == set(commands.COMMANDS)
+    for name, sentence in commands.COMMANDS.items():
+        assert sentence.endswith(".") and f"python -m mcx_jax.{name} " in said
+    assert max(map(len, said.splitlines())) <= 80
+    commands.main(["--version"])
+    assert capsys.readouterr().out == f"{mcx_jax.__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["train", "--smoke"], "train: with a dot, python -m mcx_jax.train --smoke"),
+        (["fly"], "fly: no such command; use python -m mcx_jax.NAME, where NAME is one of train, "),
+    ],
+)
+def test_python_m_mcx_jax_says_what_to_type(words, said):
+    with pytest.raises(UserError) as error:
+        commands.main(words)
+    assert str(error.value).startswith(said)
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from mcx_jax import extras
 from mcx_jax.controllers import CLASSICAL
 from mcx_jax.delay import SUBSTEPS
 from mcx_jax.env_config import EnvConfig, MotionConfig
@@ -165,8 +166,9 @@ def test_refusals(tmp_path, monkeypatch):
     for argv, message in wrong:
         refused(["ik", *argv], message)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    refused(["ik"], "play needs viser: pip install 'mcx_jax[viz]'")
-    refused(["ik", "--frame", "a.png"], "play needs pillow: pip install 'mcx_jax[viz]'")
+    install = extras.install("viz")
+    refused(["ik"], f"play needs viser: {install}")
+    refused(["ik", "--frame", "a.png"], f"play needs pillow: {install}")
 
 
 def test_the_close_up_does_not_cover_the_tool():

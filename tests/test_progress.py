@@ -11,7 +11,7 @@ import pytest
 from probe_envs import make_probe
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 
-from mcx_jax import startup
+from mcx_jax import extras, startup
 from mcx_jax.config import preset_config
 from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
 from mcx_jax.progress import Progress, references
@@ -148,11 +148,11 @@ def test_no_event_file_unless_asked(tmp_path):
 
 def test_missing_package_is_told_at_once(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("mcx_jax.tensorboard.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(SystemExit) as stop:
         startup.run_command(lambda: main(["--tensorboard"]))
     assert stop.value.code == 2
     assert capsys.readouterr().err == (
-        "error: --tensorboard needs tensorboardX: install the 'viz' extra or leave it out\n"
+        f"error: --tensorboard needs tensorboardX: {extras.install('viz')}\n"
     )
     assert not list(tmp_path.iterdir())

@@ -6,14 +6,13 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 from html.parser import HTMLParser
 
 import jax
 import numpy as np
 import pytest
 
-from mcx_jax import cli, episodes
+from mcx_jax import cli, episodes, extras
 from mcx_jax.config import TrainConfig
 from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
 from mcx_jax.envs.model import torque_limits_nm
@@ -307,10 +306,10 @@ def test_refusals(made, tmp_path):
 
 
 def test_without_matplotlib_one_clear_line(made, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     refused(
         [str(made[1]), "--out", str(tmp_path / "out")],
-        "the report needs matplotlib: pip install 'mcx_jax[viz]'",
+        f"report needs matplotlib: {extras.install('viz')}",
     )
 
 

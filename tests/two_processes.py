@@ -1,6 +1,7 @@
 """One process of several that train a run: `python two_processes.py RUN PLACE [SIGNAL ITERATION]`,
 which it sends to itself after that iteration."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from mcx_jax.training import train
 
 
 def main() -> None:
+    hosts.SILENCE_S = float(os.environ.get("SILENCE_S", hosts.SILENCE_S))
     run, place = Path(sys.argv[1]), sys.argv[2]
     if sys.argv[3:]:
         lives.signal_after(int(sys.argv[4]), int(sys.argv[3]))

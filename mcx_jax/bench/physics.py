@@ -5,16 +5,17 @@ Same task for all: the paper's arm, Euler, base at rest, servo references held, 
 angles; what one control step asks of the physics, ten steps of 2 ms, is the unit of a call.
 """
 
-import os
 from collections.abc import Callable
 from functools import partial
 from importlib.metadata import version
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mcx_jax import machine
 from mcx_jax.bench.timing import median_s
 from mcx_jax.delay import SUBSTEPS
 from mcx_jax.envs import chain
@@ -28,6 +29,18 @@ LARGE_STEPS = 100_000
 """Physics steps in a call, all environments together, at least, where a control step is less."""
 
 
+class Work(NamedTuple):
+    """What is timed of an engine."""
+
+    call: Callable[[], Any]
+    steps: int
+    """Physics steps that a call takes, all environments together."""
+
+    def steps_per_s(self, repeats: int) -> float:
+        """By the median of so many repeats."""
+        return self.steps / median_s(self.call, repeats)
+
+
 def start(model: mujoco.MjModel, envs: int) -> tuple[np.ndarray, np.ndarray]:
     """(envs, nq) joint angles, rad, and (envs, nu) commands that hold them."""
     q = np.random.default_rng(0).uniform(-1.0, 1.0, (envs, model.nq))
@@ -38,38 +51,37 @@ def start(model: mujoco.MjModel, envs: int) -> tuple[np.ndarray, np.ndarray]:
     return q, ctrl
 
 
-def c_rollout(envs: int) -> float:
-    """Physics steps/s of `mujoco.rollout` on all cores."""
+def c_rollout(envs: int) -> Work:
+    """`mujoco.rollout` on all cores."""
     from mujoco import rollout
 
     model = load_mujoco("paper")
-    threads = os.cpu_count() or 1
+    threads = machine.cores()
     datas = [mujoco.MjData(model) for _ in range(threads)]
     q, ctrl = start(model, envs)
     state = np.zeros((envs, mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS)))
     state[:, 1 : 1 + model.nq] = q  # time comes first
     steps = _steps_a_call(envs, 10_000)
     control = np.repeat(ctrl[:, None], steps, axis=1)
-    with rollout.Rollout(nthread=threads) as pool:
-        seconds = median_s(lambda: pool.rollout(model, datas, state, control))
-    return envs * steps / seconds
+    pool = rollout.Rollout(nthread=threads)
+    return Work(lambda: pool.rollout(model, datas, state, control), envs * steps)
 
 
-def c_batch(envs: int) -> float:
-    """Physics steps/s of `mujoco.batch` on all cores."""
+def c_batch(envs: int) -> Work:
+    """`mujoco.batch` on all cores."""
     from mujoco.batch import Batch
 
     model = load_mujoco("paper")
-    batch = Batch(model, nsim=envs, nthread=os.cpu_count() or 1)
+    batch = Batch(model, nsim=envs, nthread=machine.cores())
     q, ctrl = start(model, envs)
     batch.bind("qpos")[:], batch.bind("ctrl")[:] = q, ctrl
     steps = _steps_a_call(envs, 10_000)
-    return envs * steps / median_s(lambda: batch.step(nstep=steps))
+    return Work(lambda: batch.step(nstep=steps), envs * steps)
 
 
-def mjx(envs: int) -> float:
-    """Physics steps/s of MJX, without contact and constraint work."""
-    from mujoco import mjx as mj_x
+def mjx(envs: int) -> Work:
+    """MJX, without contact and constraint work."""
+    from mcx_jax.quiet_mjx import mjx as mj_x
 
     model = load_mujoco("paper")
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
@@ -86,15 +98,16 @@ def mjx(envs: int) -> float:
     arrays = put(env_mesh(envs), (q, np.zeros_like(q), ctrl), 0)
     old_emitters = jax.default_backend() == "cpu" and needs_old_emitters(version("jaxlib"))
     options = {"xla_cpu_use_fusion_emitters": False} if old_emitters else None
-    return envs * SUBSTEPS / _jax_s(jax.jit(jax.vmap(run), compiler_options=options), *arrays)
+    step = jax.jit(jax.vmap(run), compiler_options=options)
+    return _jax_work(step, arrays, envs * SUBSTEPS)
 
 
-def chain_engine(envs: int) -> float:
-    """Physics steps/s of this project's engine."""
+def chain_engine(envs: int) -> Work:
+    """This project's engine."""
     model, arrays = _chain_start(envs)
     steps = _steps_a_call(envs, LARGE_STEPS)
     step = jax.jit(partial(_chain_steps, model, "euler", steps))
-    return envs * steps / _jax_s(step, *arrays)
+    return _jax_work(step, arrays, envs * steps)
 
 
 def _chain_start(envs: int) -> tuple[ChainModel, tuple]:
@@ -106,7 +119,7 @@ def _chain_start(envs: int) -> tuple[ChainModel, tuple]:
     return chain_model(mj, "tool"), (*put(mesh, (q, np.zeros_like(q), ctrl), -1), wall)
 
 
-ENGINES: dict[str, Callable[[int], float]] = {
+ENGINES: dict[str, Callable[[int], Work]] = {
     "c-rollout": c_rollout,
     "c-batch": c_batch,
     "mjx": mjx,
@@ -124,8 +137,15 @@ def gradient_over_forward(envs: int) -> float:
         q, v = run(q, v, ctrl, wall)
         return jnp.sum(q**2) + jnp.sum(v**2)
 
-    forward = _jax_s(jax.jit(run), *arrays)
-    return _jax_s(jax.jit(jax.grad(loss, argnums=(0, 1))), *arrays) / forward
+    both = jax.jit(run), jax.jit(jax.grad(loss, argnums=(0, 1)))
+    forward, gradient = (median_s(_jax_work(step, arrays, 1).call) for step in both)
+    return gradient / forward
+
+
+def ratios(ours: Work, theirs: Work, rounds: int) -> list[float]:
+    """How many times faster ours is, measured in turn so many times: on a machine that others use,
+    or that changes its clock, one pair says little."""
+    return [ours.steps_per_s(1) / theirs.steps_per_s(1) for _ in range(rounds)]
 
 
 def _chain_steps(model: ChainModel, integrator: str, steps: int, q, v, ctrl, wall):
@@ -142,6 +162,5 @@ def _steps_a_call(envs: int, at_least: int) -> int:
     return SUBSTEPS * max(1, at_least // (SUBSTEPS * envs))
 
 
-def _jax_s(step: Callable, *arrays) -> float:
-    """Median seconds of `step(*arrays)`."""
-    return median_s(lambda: jax.block_until_ready(step(*arrays)))
+def _jax_work(step: Callable, arrays: tuple, steps: int) -> Work:
+    return Work(lambda: jax.block_until_ready(step(*arrays)), steps)

@@ -6,8 +6,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 
-from mcx_jax.bench.timing import median_s
+from mcx_jax.bench.timing import REPEATS, median_s, samples_s
 from mcx_jax.config import TrainConfig
 from mcx_jax.delay import CONTROL_DT_S, SUBSTEPS
 from mcx_jax.envs import ik, lag, observe, vessels
@@ -93,7 +94,7 @@ PARTS = {"arm": _arm, "ik": _ik, "vessels": _vessels, "lag": _lag, "observe": _o
 
 @dataclass(frozen=True)
 class TrainingSpeed:
-    """Control steps/s, and the learner beside the machine's matrix products."""
+    """Control steps/s, and the learner's rate, to compare with the machine's matrix products."""
 
     rollout_steps_per_s: float
     training_steps_per_s: float
@@ -162,15 +163,28 @@ def learner_flops(inputs: int, hidden: int, outputs: tuple[int, ...]) -> int:
     return total
 
 
-def matmul_gflops() -> float:
-    """The machine's own rate in float32, 1e9/s: the best of a square product and of the network's
-    shape."""
-    return max(_matmul_gflops(n, k, m) for n, k, m in ((1024, 1024, 1024), (2048, 256, 512)))
+SHAPES = (
+    (512, 512, 512),
+    (1024, 1024, 1024),
+    (2048, 2048, 2048),
+    (2048, 256, 512),
+    (8192, 128, 512),
+)
+"""(rows on a device, inner, columns) of the matrix products; the last two are the network's."""
 
 
-def _matmul_gflops(rows: int, inner: int, columns: int) -> float:
-    a = jax.random.normal(jax.random.key(0), (rows, inner))
-    b = jax.random.normal(jax.random.key(1), (inner, columns))
+def matmul_gflops(repeats: int = REPEATS) -> float:
+    """The machine's own rate in float32, 1e9/s: the best repeat of the best shape, on one device or
+    on all at once."""
+    meshes = [env_mesh(1), env_mesh(jax.local_device_count())]
+    return max(_matmul_gflops(mesh, shape, repeats) for mesh in meshes for shape in SHAPES)
+
+
+def _matmul_gflops(mesh: Mesh, shape: tuple[int, int, int], repeats: int) -> float:
+    inner, columns = shape[1:]
+    rows = shape[0] * mesh.size
+    a = put(mesh, jax.random.normal(jax.random.key(0), (rows, inner)), 0)
+    b = put(mesh, jax.random.normal(jax.random.key(1), (inner, columns)))
     product: Any = jax.jit(jnp.matmul)
-    seconds = median_s(lambda: jax.block_until_ready(product(a, b)))
+    seconds = min(samples_s(lambda: jax.block_until_ready(product(a, b)), repeats))
     return 2e-9 * rows * inner * columns / seconds

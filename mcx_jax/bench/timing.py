@@ -1,4 +1,4 @@
-"""Medians of repeated runs."""
+"""Repeated runs, timed."""
 
 import statistics
 import time
@@ -11,8 +11,8 @@ MIN_S = 0.15
 vanish."""
 
 
-def median_s(call: Callable[[], Any], repeats: int = REPEATS) -> float:
-    """Median seconds of one call, after one call that is not counted.
+def samples_s(call: Callable[[], Any], repeats: int = REPEATS) -> list[float]:
+    """Seconds of one call, `repeats` times, after one call that is not counted.
 
     Args:
         call: runs to the end before it returns (block on JAX results inside).
@@ -23,7 +23,12 @@ def median_s(call: Callable[[], Any], repeats: int = REPEATS) -> float:
     samples = [once] if count == 1 else []
     while len(samples) < repeats:
         samples.append(_elapsed_s(call, count) / count)
-    return statistics.median(samples)
+    return samples
+
+
+def median_s(call: Callable[[], Any], repeats: int = REPEATS) -> float:
+    """Median of `samples_s`."""
+    return statistics.median(samples_s(call, repeats))
 
 
 def _elapsed_s(call: Callable[[], Any], count: int) -> float:

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import lax
-from mujoco import mjx
 
 from mcx_jax.envs.dynamics import BaseState
+from mcx_jax.quiet_mjx import mjx
 
 INTEGRATORS = {
     "euler": mujoco.mjtIntegrator.mjINT_EULER,

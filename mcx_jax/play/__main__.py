@@ -4,7 +4,6 @@ WHO is whatever `evaluate` takes; ik is always beside it.
 """
 
 import dataclasses
-import importlib.util
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -70,7 +69,7 @@ class PlayConfig:
 
 def main(argv: list[str] | None = None) -> None:
     """Command line."""
-    from mcx_jax import cli, startup
+    from mcx_jax import cli, extras, startup
     from mcx_jax.report import entries
     from mcx_jax.roster import fit_if_needed
 
@@ -79,7 +78,7 @@ def main(argv: list[str] | None = None) -> None:
     (name,) = entries.check_names([config.who])[-1:]
     cli.check_output("--video", config.video)
     cli.check_output("--frame", config.frame)
-    _require("imageio_ffmpeg" if config.video else "PIL" if config.frame else "viser")
+    extras.require("imageio_ffmpeg" if config.video else "PIL" if config.frame else "viser", "play")
     if config.to_file:
         from mcx_jax.play import gl
 
@@ -131,13 +130,6 @@ def to_file(config: PlayConfig, entry) -> None:
     say = lambda text: print(text, flush=True)  # noqa: E731
     frames = video.write_film(Path(config.video), take, config.env, config.motion, say)
     print(f"done: {config.video}, {frames} frames, {video.FPS} a second")
-
-
-def _require(module: str) -> None:
-    """Refuse what an extra has to bring, before anything else is done."""
-    if importlib.util.find_spec(module) is None:
-        name = {"imageio_ffmpeg": "imageio[ffmpeg]", "PIL": "pillow"}.get(module, module)
-        raise UserError(f"play needs {name}: pip install 'mcx_jax[viz]'")
 
 
 if __name__ == "__main__":

@@ -47,17 +47,14 @@ class ReportConfig:
 
 def main(argv: list[str] | None = None) -> None:
     """Command line."""
-    from mcx_jax import startup
+    from mcx_jax import extras, startup
     from mcx_jax.report import entries
 
     argv = list(sys.argv[1:] if argv is None else argv)
     config = cli.parse(ReportConfig, argv, prog="report")
     names = entries.check_names(config.runs)
     out = check_out(config.out)
-    try:
-        import matplotlib.figure  # noqa: F401
-    except ImportError:
-        raise UserError("the report needs matplotlib: pip install 'mcx_jax[viz]'") from None
+    extras.require("matplotlib", "report")
     for line in startup.configure(config.device, mjx=config.env.physics == "mjx"):
         print(line)
     loaded = entries.load_entries(names)
