@@ -1,6 +1,7 @@
 """Controllers by the name that the commands use. Needs no JAX until one is loaded."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ from mcx_jax.assets import policy_file
 from mcx_jax.delay import parse_delay
 from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.errors import UserError
+from mcx_jax.terminal import silent
 
 WHO = ("ik", "extrapolate", "extrapolate-best", "fir", "preview")
 FITTED = ("extrapolate-best", "fir")
@@ -46,15 +48,25 @@ def load_controller(who: str) -> tuple[str, Any]:
 
 
 def fit_if_needed(
-    who: str, controller: Any, env_config: EnvConfig, motion_config: MotionConfig, known_delay: str
+    who: str,
+    controller: Any,
+    env_config: EnvConfig,
+    motion_config: MotionConfig,
+    known_delay: str,
+    say: Callable[[str], None] = silent,
 ) -> Any:
-    """The controller of `load_controller`, fitted on training motion if it is one of FITTED."""
+    """The controller of `load_controller`, fitted on training motion if it is one of FITTED.
+
+    Args:
+        say: what happens is said to it (`mcx_jax.terminal.working`).
+    """
     if controller is not None:
         return controller
     from mcx_jax.envs.v2v import make_env
     from mcx_jax.fitted import fitted
 
-    return fitted(who, informed(make_env(env_config, motion_config, split="train"), known_delay))
+    env = informed(make_env(env_config, motion_config, split="train"), known_delay)
+    return fitted(who, env, say)
 
 
 def informed(env, known_delay: str):
