@@ -34,7 +34,11 @@ def policy_path(who: str) -> Path | None:
 
 def load_controller(who: str) -> tuple[str, Any]:
     """(name, controller) for a name, a run directory or a policy file; the controller is None for
-    one of FITTED, which needs a task first (`fit_if_needed`)."""
+    one of FITTED, which needs a task first (`fit_if_needed`).
+
+    Raises:
+        UserError: no such controller, a file that is no policy, or one for another task.
+    """
     path = policy_path(who)
     if who in FITTED:
         return who, None
@@ -42,9 +46,11 @@ def load_controller(who: str) -> tuple[str, Any]:
         from mcx_jax.controllers import CLASSICAL
 
         return who, CLASSICAL[who]
-    from mcx_jax.policy import PolicyController, load_policy
+    from mcx_jax.policy import PolicyController, load_policy, require_task
 
-    return who.rstrip("/"), PolicyController(load_policy(path))
+    policy = load_policy(path)
+    require_task(path, policy.meta)
+    return who.rstrip("/"), PolicyController(policy)
 
 
 def fit_if_needed(
