@@ -113,6 +113,7 @@ def iterate(
     from mcx_jax.divergence import Watch
 
     config, progress = run.config, Progress(run.config, run.start_iteration)
+    progress.begin()
     watch = Watch(run)
     saved = time.monotonic()
     rows = run.last_rows()
