@@ -4,6 +4,11 @@ All in one run, rivals included; medians of five (training under --quick: three)
 apart.
 """
 
+if __name__ == "__main__":
+    from mcx_jax.command import begin
+
+    begin()
+
 import importlib.util
 import json
 import resource
