@@ -557,6 +557,23 @@ def test_smoke_runs_the_whole_path(tmp_path):
     assert done.stdout.splitlines()[-1] == f"done: {tmp_path / 'run' / 'policy.npz'}"
 
 
+@pytest.mark.slow
+def test_the_command_without_its_output(tmp_path):
+    """Exit code 0, the table left out of nothing but sight, and bit for bit the same policy."""
+    smoke = [sys.executable, "-m", "mcx_jax.train", "--smoke", "--delay", "E1", "--run-dir"]
+    subprocess.run([*smoke, str(tmp_path / "whole")], check=True, capture_output=True)
+    for (kind, make), why in zip(LOST.items(), REASONS, strict=True):
+        stream, path = make(), tmp_path / kind
+        run = [*smoke, str(path)]
+        if stream is None:
+            run = ["sh", "-c", 'exec "$@" >&- 2>&-', "sh", *run]
+        done = subprocess.run(run, stdout=stream, stderr=stream, check=False)
+        assert done.returncode == 0, kind
+        assert _same_policy(path, tmp_path / "whole")
+        said = (path / "messages.log").read_text()
+        assert f"standard output cannot be written ({why}); the work goes on" in said
+
+
 def test_nothing_is_traced_after_the_first_checkpoint(tmp_path, monkeypatch, caplog):
     """Neither iterations nor checkpoints: what is traced time and again is kept, and grows."""
     seen, append = [], RunDir.append
