@@ -12,6 +12,7 @@ and a mismatch can be named. Leaves without elements (a delay line of length 0) 
 refuses them. Nothing is unpickled or executed (docs/trust.md).
 """
 
+import contextlib
 import hashlib
 import json
 import logging
@@ -19,6 +20,7 @@ import os
 import platform
 import shutil
 import sys
+from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -62,8 +64,8 @@ def save(run_dir: Path, iteration: int, state: Any, config: str = "") -> None:
             shutil.rmtree(left)
         partial.mkdir()
         ocp = _orbax()
-        with _checkpointer(ocp) as writer:
-            writer.save(partial / STATE, args=ocp.args.StandardSave(flat))
+        with _checkpointer(ocp) as writer, _plain_name(partial) as inside:
+            writer.save(inside / STATE, args=ocp.args.StandardSave(flat))
         _write_manifest(partial, iteration, config, _types(flat))
         partial.rename(folder / str(iteration))
         _sync(folder)
@@ -132,8 +134,8 @@ def restore(run_dir: Path, like: Any, iteration: int | None = None) -> Any:
     # Read into the host's memory and laid out from there, which any number of processes can do.
     blank = {path: np.zeros(leaf.shape, leaf.dtype) for path, leaf in wanted.items()}
     try:
-        with _checkpointer(ocp) as reader:
-            stored = reader.restore(where / STATE, args=ocp.args.StandardRestore(blank))
+        with _checkpointer(ocp) as reader, _plain_name(where) as inside:
+            stored = reader.restore(inside / STATE, args=ocp.args.StandardRestore(blank))
     except (ValueError, KeyError, OSError, TypeError) as error:
         raise UserError(f"{where}: cannot be restored ({reason(error)})") from None
     return _unflatten(like, {path: _laid_out(x, wanted[path]) for path, x in stored.items()})
@@ -303,6 +305,21 @@ def _checkpointer(ocp: Any) -> Any:
     me = jax.process_index()
     options = ocp.options.MultiprocessingOptions(primary_host=me, active_processes={me})
     return ocp.Checkpointer(ocp.StandardCheckpointHandler(), multiprocessing_options=options)
+
+
+@contextlib.contextmanager
+def _plain_name(folder: Path) -> Iterator[Path]:
+    """Another name of a directory, for orbax: without characters of a user's directories.
+
+    tensorstore takes a backslash for a slash (and writes somewhere else), orbax's search takes
+    [, ], * and ? for patterns. Where there is no /proc the name stays what it is.
+    """
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        name = Path(f"/proc/self/fd/{handle}")
+        yield name if name.exists() else folder
+    finally:
+        os.close(handle)
 
 
 def _unraisable(what: Any) -> None:

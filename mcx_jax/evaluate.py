@@ -4,6 +4,11 @@ WHO is ik, extrapolate, extrapolate-best, fir, preview, shipped:DELAY, a run dir
 file. The same seed gives the same motion and the same goals to everyone.
 """
 
+if __name__ == "__main__":
+    from mcx_jax.command import begin
+
+    begin()
+
 import json
 import sys
 from collections.abc import Callable

@@ -15,6 +15,11 @@ with the normalisation inside; the interface (`mcx_jax.interface`) is printed.
   on, not to archive.
 """
 
+if __name__ == "__main__":
+    from mcx_jax.command import begin
+
+    begin()
+
 import sys
 from dataclasses import dataclass
 from pathlib import Path

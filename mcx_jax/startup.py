@@ -12,7 +12,7 @@ from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
-from mcx_jax import extras, hosts, jax_settings, machine
+from mcx_jax import extras, hosts, jax_settings, machine, streams
 from mcx_jax.errors import UserError, reason
 
 FUSION_FLAG = "--xla_cpu_use_fusion_emitters"
@@ -175,10 +175,13 @@ def _check_device(jax, device: str) -> None:
 
 def run_command(main: Callable[[], None]) -> None:
     """Run a command's `main`: a `UserError` becomes one line on stderr and exit code 2, Ctrl-C
-    ends with code 130."""
+    ends with code 130, and output that cannot be written ends nothing (`mcx_jax.streams`)."""
+    streams.guard()
     try:
         main()
+        streams.check()
     except UserError as error:
+        streams.end_line()
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:

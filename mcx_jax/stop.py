@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any, Self
 
+from mcx_jax import streams
+
 
 @dataclass
 class StopRequest:
@@ -28,4 +30,4 @@ class StopRequest:
         del frame
         self.signum = signum
         signal.signal(signum, self.previous[signum])
-        print("\nstopping at the end of this iteration (again: at once)", flush=True)
+        streams.say_at_once("stopping at the end of this iteration (again: at once)")

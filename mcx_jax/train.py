@@ -4,6 +4,11 @@ Writes DIR/{config.json, metrics.jsonl, checkpoints/, policy.npz}. The command l
 directory checked before anything is computed, so that a mistake is told at once.
 """
 
+if __name__ == "__main__":
+    from mcx_jax.command import begin
+
+    begin()
+
 import functools
 import os
 import sys
@@ -13,8 +18,9 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from mcx_jax import cli, hosts, machine, tensorboard
+from mcx_jax import cli, hosts, machine, streams, tensorboard
 from mcx_jax.assets import policy_file
+from mcx_jax.command import last_words
 from mcx_jax.config import TrainConfig, preset_config
 from mcx_jax.errors import UserError
 from mcx_jax.run_dir import (
@@ -25,13 +31,16 @@ from mcx_jax.run_dir import (
     open_new,
     stored_config,
 )
-from mcx_jax.training import train
+from mcx_jax.training import rest, train
 
 if TYPE_CHECKING:
     from mcx_jax.policy import Policy
 
 FIRST_ORDER_USES = ("hidden", "cell", "lr_decay", "max_grad_norm")
 """Settings of PPO that --algo first-order has, too."""
+
+STORED = ("run_dir", "resume", "resume_from", "train")
+"""Fields of TrainCommand that a run's directory holds, or that --resume replaces."""
 
 FINAL_EPISODES, FINAL_STEPS = 50, 1000
 SMOKE_EPISODES, SMOKE_STEPS = 2, 96
@@ -127,10 +136,25 @@ def read_command(argv: list[str]) -> tuple[TrainCommand, RunDir]:
     if not command.resume and not command.resume_from:
         _refuse_unused(command.train, defaults)
         _refuse_no_policy(command.train.start_from)
-        return command, open_new(_directory(command), command.train)
+        run = open_new(_directory(command), command.train)
+        run.options = _options(command)
+        return command, run
     path = Path(command.run_dir) if command.run_dir else default_path(command.train)
     command = parse(default=TrainCommand(train=stored_config(path)))
-    return command, open_existing(path, command.train, command.resume_from)
+    run = open_existing(path, command.train, command.resume_from)
+    run.options = _options(command)
+    return command, run
+
+
+def _options(command: TrainCommand) -> tuple[str, ...]:
+    """The flags that change a run and are not in its configuration."""
+    words: list[str] = []
+    for setting in fields(TrainCommand):
+        value = getattr(command, setting.name)
+        if setting.name not in STORED and value != setting.default:
+            flag = f"--{setting.name.replace('_', '-')}"
+            words += [flag] if value is True else [flag, str(value)]
+    return tuple(words)
 
 
 def _directory(command: TrainCommand) -> Path:
@@ -195,26 +219,20 @@ def main(argv: list[str] | None = None) -> None:
     print(f"run directory: {run.path}", flush=True)
     from mcx_jax.envs.v2v import make_env
 
-    try:
+    with last_words(lambda: f"stopped at once; {rest(run)}"):
         policy = train(
             run,
             make_env,
             events=command.tensorboard,
             checkpoint_interval_s=command.checkpoint_interval_s,
         )
-    except KeyboardInterrupt:
-        print("\nstopped before the end of an iteration; go on with --resume if a run had begun")
-        raise SystemExit(130) from None
-    hosts.part()
-    if not hosts.first():
-        return
-    length = (SMOKE_EPISODES, SMOKE_STEPS) if command.smoke else (FINAL_EPISODES, FINAL_STEPS)
-    try:
+        hosts.part()
+        if not hosts.first():
+            return
+        length = (SMOKE_EPISODES, SMOKE_STEPS) if command.smoke else (FINAL_EPISODES, FINAL_STEPS)
         final_table(run.config, policy, *length)
-    except KeyboardInterrupt:
-        print(f"\nstopped before the table; python -m mcx_jax.evaluate {run.path} makes it")
-        raise SystemExit(130) from None
     print(f"done: {run.path / POLICY}")
+    run.note(streams.take_losses())
 
 
 if __name__ == "__main__":

@@ -7,14 +7,13 @@ import contextlib
 import math
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from mcx_jax import checkpoint, cli, hosts, tensorboard
+from mcx_jax import checkpoint, cli, command, hosts, streams, tensorboard
 from mcx_jax.config import TrainConfig
 from mcx_jax.errors import UserError
 from mcx_jax.progress import Progress, short_time
-from mcx_jax.run_dir import POLICY, RunDir, writing
+from mcx_jax.run_dir import CONFIG, POLICY, RunDir, writing
 from mcx_jax.stop import StopRequest
 from mcx_jax.terminal import working
 
@@ -76,12 +75,25 @@ def save(run: RunDir, state: "TrainState", rows: list[dict[str, Any]]) -> "tuple
 
     Returns:
         The best policy, and its seed.
+
+    Raises:
+        UserError: they cannot be written.
     """
+    try:
+        return _save(run, state, rows)
+    except UserError:
+        # Alone, since all processes have to take part in a checkpoint.
+        if not (hosts.alone() and run.follow()):
+            raise
+        return _save(run, state, rows)  # the directory was moved meanwhile
+
+
+def _save(run: RunDir, state: "TrainState", rows: list[dict[str, Any]]) -> "tuple[Policy, int]":
     from mcx_jax.policy import save_policy
 
     policies = policies_of(run.config, state)
-    rewards = [row["reward"] for row in rows] or [0.0] * len(policies)
-    best = max(range(len(policies)), key=lambda k: (math.isfinite(rewards[k]), rewards[k]))
+    rewards = {row["seed"]: row["reward"] for row in rows if math.isfinite(row["reward"])}
+    best = max(range(len(policies)), key=lambda k: rewards.get(policies[k].meta.seed, -math.inf))
     if run.writes:
         with writing(run.path):
             if len(policies) > 1:
@@ -121,12 +133,12 @@ def iterate(
         watch.before_iteration(state)
         state, metrics = training.iterate(state, iteration - 1)
         rows = metric_rows(config, iteration, metrics)
-        run.append([{**row, "wall_s": time.monotonic() - progress.begun} for row in rows])
+        moved = run.append([{**row, "wall_s": time.monotonic() - progress.begun} for row in rows])
         if events:
             events.append(rows)
         progress.show(rows)
         watch.after_iteration(state, rows)
-        overdue = time.monotonic() - saved > checkpoint_interval_s
+        overdue = moved or time.monotonic() - saved > checkpoint_interval_s
         signum, overdue = hosts.agree(stop.signum, overdue)
         if signum:  # not stored unless there is one: a signal that came meanwhile is kept
             stop.signum = signum
@@ -137,6 +149,7 @@ def iterate(
             saved = time.monotonic()
     watch.check(state, rows)
     policy, seed = save(run, state, rows)
+    run.note(streams.take_losses())
     if config.seeds > 1:
         print(f"{run.path / POLICY}: seed {seed}, the best of {config.seeds} by training reward")
     return policy
@@ -184,7 +197,7 @@ def train(
             diverges.
         SystemExit: stopped by a signal, after saving.
     """
-    run = replace(run, writes=hosts.first())
+    run.writes = hosts.first()
     with hosts.together(run.path), run.held():
         return _train(run, make_env, events and run.writes, checkpoint_interval_s)
 
@@ -215,6 +228,8 @@ def _train(
     hosts.agree(0)  # the others read what it has cut
     if run.start_iteration:
         print(f"going on after iteration {run.start_iteration}")
+    elif config.iterations * config.steps_per_iteration != config.total_steps:
+        print(rounded_up(config))
     with contextlib.ExitStack() as stack:
         file = None
         if events:
@@ -222,7 +237,29 @@ def _train(
             stack.enter_context(file)
         stop = stack.enter_context(StopRequest())
         policy = iterate(run, training, state, stop, file, checkpoint_interval_s)
-    if stop.signum and policy.meta.iteration < config.iterations:
-        print(f"saved; go on with: python -m mcx_jax.train --run-dir {run.path} --resume")
+    if stop.signum:
+        streams.end_line()
+        print(f"saved after iteration {policy.meta.iteration} of {config.iterations}; {rest(run)}")
         raise SystemExit(128 + stop.signum)
     return policy
+
+
+def rounded_up(config: TrainConfig) -> str:
+    """What is said where --total-steps is no whole number of iterations."""
+    whole = config.iterations * config.steps_per_iteration
+    return (
+        f"--total-steps {config.total_steps:,} is rounded up to {whole:,}: {config.iterations} "
+        f"iterations of {config.steps_per_iteration:,} steps"
+    )
+
+
+def rest(run: RunDir) -> str:
+    """What is left to do after the last checkpoint, and the command that does it."""
+    last = checkpoint.latest(run.path)
+    if last == run.config.iterations:
+        return f"make the table with:\n{command.line('evaluate', run.path)}"
+    if last:
+        return f"go on from iteration {last} with:\n{run.resume_line}"
+    if (run.path / CONFIG).exists():
+        return f"there is no checkpoint yet; begin again with:\n{run.resume_line}"
+    return "the run had not begun, nothing is saved"

@@ -62,6 +62,16 @@ def test_restored_exactly(tmp_path, monkeypatch):
     _same(checkpoint.restore(tmp_path, shapes), _state(1))
 
 
+@pytest.mark.parametrize("name", ["r[1]", "a*b", "a?b", "a\\b", "a b", "$x", "\udcff", "{a}#%20"])
+def test_a_directory_of_any_name(name, tmp_path):
+    """In place, not in another directory whose name a pattern matches (a\\b was a/b)."""
+    run, other = tmp_path / name, tmp_path / "aXb"
+    checkpoint.save(other, 3, _state(2))
+    checkpoint.save(run, 3, _state(1))
+    assert sorted(tmp_path.iterdir()) == sorted([run, other])
+    _same(checkpoint.restore(run, _state(2)), _state(1))
+
+
 def test_the_newest_of_two(tmp_path):
     assert checkpoint.latest(tmp_path) is None
     for iteration in (2, 5, 9):

@@ -101,7 +101,10 @@ def test_two_processes(repo_root, place, pair):
     both = pair("both", signal.SIGTERM, 3)
     codes, said, errors = ends(both)
     assert codes == [128 + signal.SIGTERM] * 2, errors
-    assert "saved; go on with" in said[0] and "iterations of" not in said[1]
+    assert (
+        "saved after iteration 3 of 100; go on from iteration 3 with:" in said[0]
+        and "iterations of" not in said[1]
+    )
     assert len(rows_of(run)) == 3
     assert_alike(rows_of(run), whole[:3])
 

@@ -6,17 +6,21 @@ Training runs on a probe environment here; the whole path with the real one is t
 import functools
 import json
 import os
+import shlex
+import shutil
 import signal
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 from probe_envs import make_probe
+from test_output import LOST, REASONS
 
-from mcx_jax import checkpoint, cli, startup
+from mcx_jax import checkpoint, cli, command, startup
 from mcx_jax.config import TrainConfig, preset_config
 from mcx_jax.env_config import EnvConfig
 from mcx_jax.errors import UserError
@@ -25,8 +29,9 @@ from mcx_jax.programs import prepare
 from mcx_jax.progress import Progress, short_time
 from mcx_jax.run_dir import RunDir, default_path, open_existing, open_new
 from mcx_jax.stop import StopRequest
+from mcx_jax.streams import Guarded
 from mcx_jax.train import compile_quickly, main, read_command
-from mcx_jax.training import first_policy, train
+from mcx_jax.training import first_policy, rest, rounded_up, train
 
 CONFIG = replace(
     preset_config("fast"),
@@ -113,6 +118,149 @@ def test_stopped_and_resumed_is_never_stopped(finished, tmp_path, monkeypatch, c
         file.write('{"iteration": 3, "wall_s": 0.0}\n{"iterat')
     train(open_existing(path, CONFIG), _make_env)
     _assert_same_run(path, finished, CONFIG)
+
+
+def _at_iterations(monkeypatch, *actions):
+    """Call an action with the run's progress after iteration 1, 2, ..."""
+    show = Progress.show
+
+    def show_and_act(self, rows):
+        show(self, rows)
+        actions[rows[0]["iteration"] - 1]()
+
+    monkeypatch.setattr(Progress, "show", show_and_act)
+
+
+def _same_policy(one, other):
+    return (one / "policy.npz").read_bytes() == (other / "policy.npz").read_bytes()
+
+
+def test_no_state_of_the_output_changes_a_run(finished, tmp_path, monkeypatch):
+    """All kinds of a lost standard output in one run, another one in every iteration."""
+    path, show = tmp_path / "run", Progress.show
+    lost = [Guarded(kind(), "standard output") for kind in LOST.values()]
+
+    def lose_and_show(self, rows):
+        self.out = lost[rows[0]["iteration"] - 1]
+        self.printed = -1e9  # whatever the interval
+        monkeypatch.setattr(sys, "stdout", self.out)
+        show(self, rows)
+
+    monkeypatch.setattr(Progress, "show", lose_and_show)
+    train(open_new(path, CONFIG), _make_env)
+    _assert_same_run(path, finished, CONFIG)
+    assert _same_policy(path, finished)
+    said = (path / "messages.log").read_text().splitlines()
+    assert [line.split(" ", 2)[2] for line in said] == [
+        f"standard output cannot be written ({why}); the work goes on" for why in REASONS
+    ]
+
+
+def test_a_directory_that_is_renamed_moved_and_deleted(finished, tmp_path, monkeypatch, capsys):
+    """The run follows it, from a relative name, and saves all that it has; Ctrl-C in the last
+    iteration leaves the table out, and says so."""
+    monkeypatch.chdir(tmp_path)
+    first, second = tmp_path / "run", tmp_path / "deep" / "new name"
+
+    def rename():
+        second.parent.mkdir()
+        first.rename(second)
+
+    def delete():
+        # Saved because it had moved, long before the interval is over.
+        assert {"metrics.jsonl", "policy.npz", "checkpoints"} <= set(os.listdir(second))
+        shutil.rmtree(second.parent)
+
+    (tmp_path / "other").mkdir()
+    leave = functools.partial(os.chdir, tmp_path / "other")
+    stop = functools.partial(os.kill, os.getpid(), signal.SIGTERM)
+    with monkeypatch.context() as patch:
+        _at_iterations(patch, rename, leave, delete, stop)
+        with pytest.raises(SystemExit) as stopped:
+            train(open_new(Path("run"), CONFIG), _make_env)
+    assert stopped.value.code == 128 + signal.SIGTERM
+    _assert_same_run(second, finished, CONFIG)
+    assert _same_policy(second, finished)
+    out = capsys.readouterr().out.splitlines()
+    said = [
+        f"{first} is now {second}: the run goes on there",
+        f"{second} is gone: the run goes on in {second}, and is saved there at once",
+    ]
+    assert [line for line in out if line in said] == said
+    assert (second / "messages.log").read_text().rstrip().endswith(said[1])
+    assert out[-2:] == [
+        "saved after iteration 4 of 4; make the table with:",
+        shlex.join([*_python(), "-m", "mcx_jax.evaluate", str(second)]),
+    ]
+    assert open_existing(second, CONFIG).start_iteration == 4
+
+
+def test_another_directory_in_the_place_of_the_deleted_one(tmp_path):
+    run = open_new(tmp_path / "run", CONFIG)
+    with run.held():
+        run.create()
+        run.append([{"iteration": 1}])
+        shutil.rmtree(run.path)
+        run.path.mkdir()
+        assert run.append([{"iteration": 2}]) and run.path == tmp_path / "run-2"
+        assert [row["iteration"] for row in run.last_rows(9)] == [1, 2]
+        with pytest.raises(UserError, match="another process"), RunDir(run.path, CONFIG).held():
+            pass
+
+
+def _python():
+    """The interpreter in a printed command: `python` where that is this one."""
+    return shlex.split(command.line("train"))[:1]
+
+
+def test_a_printed_command_works_as_printed(tmp_path, monkeypatch):
+    """Where `python` is another one or none (`make train`), and for names of several words."""
+    ours = tmp_path / "python"
+    ours.touch(mode=0o755)
+    monkeypatch.setattr(sys, "executable", str(ours))
+    for path, python in ((tmp_path, "python"), (tmp_path / "none", str(ours))):
+        monkeypatch.setenv("PATH", str(path))
+        assert command.line("train", "--run-dir", "a b") == (
+            f"{python} -m mcx_jax.train --run-dir 'a b'"
+        )
+
+
+FLAGS = ["--smoke", "--device", "cpu", "--tensorboard", "--checkpoint-interval-s", "5.0"]
+
+
+def test_the_command_that_resumes_has_the_flags_of_the_run(tmp_path):
+    """Without --smoke it would compile at another optimisation level."""
+    command, run = read_command([*FLAGS, "--run-dir", str(tmp_path / "a b")])
+    with run.held():
+        run.create()
+    words = shlex.split(run.resume_line)
+    assert words[1:3] == ["-m", "mcx_jax.train"]
+    again, resumed = read_command(words[3:])
+    assert again == replace(command, resume=True) and resumed.options == run.options
+    assert rest(resumed) == f"there is no checkpoint yet; begin again with:\n{run.resume_line}"
+    (run.path / "checkpoints" / "7").mkdir(parents=True)
+    assert rest(run) == f"go on from iteration 7 with:\n{run.resume_line}"
+    assert rest(RunDir(tmp_path, CONFIG)) == "the run had not begun, nothing is saved"
+
+
+def test_steps_that_are_no_whole_number_of_iterations_are_rounded_up_aloud():
+    config = replace(preset_config("fast"), num_envs=2048, total_steps=300_000)
+    assert rounded_up(config) == (
+        "--total-steps 300,000 is rounded up to 327,680: 5 iterations of 65,536 steps"
+    )
+
+
+@pytest.mark.parametrize("name", ["lost", "reward", "seed"])
+def test_a_row_without_a_number_that_is_needed(name, finished, tmp_path, capsys):
+    path = tmp_path / "run"
+    shutil.copytree(finished, path)
+    rows = [json.loads(line) for line in (path / "metrics.jsonl").read_text().splitlines()]
+    del rows[2][name]
+    (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    assert _refused(["--run-dir", str(path), "--resume"], capsys) == (
+        f"{path / 'metrics.jsonl'}: the row of iteration 3 has no number {name!r}; put it back, or "
+        "take the line out"
+    )
 
 
 @pytest.mark.parametrize("seeds", [1, 2])
@@ -248,15 +396,15 @@ SAME = ["--num-envs", "64", "--total-steps", "4096"]
         (SAME, "{path}: holds a finished run; name another directory with --run-dir"),
         (
             [*SAME, "--seed", "1"],
-            "{path}: holds a run with --seed 0, not 1; name another directory",
+            "{path}: holds a run with --seed 0, not 1; name another directory with --run-dir",
         ),
         (
             [*SAME, "--delay", "E2"],
-            "{path}: holds a run with --delay B4_4, not E2; name another directory",
+            "{path}: holds a run with --delay B4_4, not E2; name another directory with --run-dir",
         ),
         (
             ["--resume", "--delay", "E2"],
-            "{path}: holds a run with --delay B4_4, not E2; name another directory",
+            "{path}: holds a run with --delay B4_4, not E2; name another directory with --run-dir",
         ),
     ],
 )
@@ -407,6 +555,23 @@ def test_smoke_runs_the_whole_path(tmp_path):
     rows = [tuple(words[:2]) for words in lines if words[1:] and words[1] in seas]
     assert rows == [(who, sea) for who in ("ik", "policy") for sea in seas]
     assert done.stdout.splitlines()[-1] == f"done: {tmp_path / 'run' / 'policy.npz'}"
+
+
+@pytest.mark.slow
+def test_the_command_without_its_output(tmp_path):
+    """Exit code 0, the table left out of nothing but sight, and bit for bit the same policy."""
+    smoke = [sys.executable, "-m", "mcx_jax.train", "--smoke", "--delay", "E1", "--run-dir"]
+    subprocess.run([*smoke, str(tmp_path / "whole")], check=True, capture_output=True)
+    for (kind, make), why in zip(LOST.items(), REASONS, strict=True):
+        stream, path = make(), tmp_path / kind
+        run = [*smoke, str(path)]
+        if stream is None:
+            run = ["sh", "-c", 'exec "$@" >&- 2>&-', "sh", *run]
+        done = subprocess.run(run, stdout=stream, stderr=stream, check=False)
+        assert done.returncode == 0, kind
+        assert _same_policy(path, tmp_path / "whole")
+        said = (path / "messages.log").read_text()
+        assert f"standard output cannot be written ({why}); the work goes on" in said
 
 
 def test_nothing_is_traced_after_the_first_checkpoint(tmp_path, monkeypatch, caplog):

@@ -4,6 +4,11 @@ All in one run, rivals included; medians of five (training and ratios under --qu
 times apart. Ratios are measured again, engine and rival in turn, and given as a range.
 """
 
+if __name__ == "__main__":
+    from mcx_jax.command import begin
+
+    begin()
+
 import json
 import os
 import statistics

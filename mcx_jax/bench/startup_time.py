@@ -7,6 +7,7 @@ import tempfile
 import time
 from pathlib import Path
 
+from mcx_jax.command import interruptible
 from mcx_jax.errors import UserError
 
 LIMIT_S = 600.0
@@ -14,7 +15,7 @@ LIMIT_S = 600.0
 
 def first_metrics_s() -> dict[str, float]:
     """{"cold", "warm"}: preset fast with all its environments, compilation cache empty and full."""
-    with tempfile.TemporaryDirectory() as folder:
+    with interruptible(), tempfile.TemporaryDirectory() as folder:
         cache = Path(folder) / "cache"
         return {name: _first_metrics_s(Path(folder) / name, cache) for name in ("cold", "warm")}
 

@@ -3,6 +3,11 @@
 WHO is whatever `evaluate` takes; ik is always beside it.
 """
 
+if __name__ == "__main__":
+    from mcx_jax.command import begin
+
+    begin()
+
 import dataclasses
 import sys
 from dataclasses import dataclass, field
@@ -11,6 +16,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from mcx_jax.command import interruptible
 from mcx_jax.config import check_seed
 from mcx_jax.delay import CONTROL_DT_S
 from mcx_jax.env_config import EnvConfig, MotionConfig
@@ -96,12 +102,13 @@ def main(argv: list[str] | None = None) -> None:
         settings = {"delay": config.env.delay}  # the page warns where another one is chosen
         entry = dataclasses.replace(entry, controller=fitted, settings=settings)
     try:
-        if config.to_file:
-            to_file(config, entry)
-        else:
-            from mcx_jax.play.player import serve
+        with interruptible():
+            if config.to_file:
+                to_file(config, entry)
+            else:
+                from mcx_jax.play.player import serve
 
-            serve(config, entry)
+                serve(config, entry)
     except KeyboardInterrupt:
         print("\nstopped")
         # A page is there until it is stopped; a file is not written.

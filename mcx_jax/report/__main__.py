@@ -3,6 +3,11 @@
 RUN is what `evaluate` takes; ik is always there.
 """
 
+if __name__ == "__main__":
+    from mcx_jax.command import begin
+
+    begin()
+
 import dataclasses
 import sys
 from dataclasses import dataclass, field

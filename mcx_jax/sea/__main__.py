@@ -1,5 +1,10 @@
 """`python -m mcx_jax.sea`: motion statistics of the generator beside the paper's table 1."""
 
+if __name__ == "__main__":
+    from mcx_jax.command import begin
+
+    begin()
+
 import json
 import math
 import sys
