@@ -12,7 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from mcx_jax.envs.model import ChainModel, Link, refuse_unsupported
+from mcx_jax.envs import dynamics
+from mcx_jax.envs.fields import integrator, refuse_unsupported
+from mcx_jax.envs.model import ChainModel, Link
+from mcx_jax.errors import require
 from mcx_jax.quiet_mjx import mjx
 from mcx_jax.spatial import (
     EYE,
@@ -80,10 +83,11 @@ def read(m: mjx.Model) -> Arm:
     flags = m.opt.disableflags
     stiffness = _numbers(m.jnt_stiffness if not flags & mjx.DisableBit.SPRING else np.zeros(m.njnt))
     gravity = ZERO if flags & mjx.DisableBit.GRAVITY else _numbers(m.opt.gravity)
-    integrator = {0: "euler", 3: "implicitfast"}[int(m.opt.integrator)]
     (timestep_s,) = _numbers(m.opt.timestep[None])
+    model = ChainModel(tuple(links), (), EYE, ZERO, timestep_s, integrator(m), gravity)
+    _refuse_hidden_armature(m, model)
     return Arm(
-        model=ChainModel(tuple(links), (), EYE, ZERO, timestep_s, integrator, gravity),
+        model=model,
         gravity=gravity,
         timestep_s=timestep_s,
         springs=list(zip(stiffness, _numbers(m.qpos_spring), strict=True)),
@@ -94,6 +98,10 @@ def read(m: mjx.Model) -> Arm:
 
 def _refuse(m: mjx.Model) -> None:
     """`refuse_unsupported`, where traced numbers count as zero and MJX's static flags for them."""
+    require(
+        m.nhistory == 0,
+        "mjx_step: the model has delayed actuators or sensors; take the delay out of the MJCF file",
+    )
     view: dict[str, Any] = {f.name: getattr(m, f.name) for f in fields(m)}
     for name, value in view.items():
         if isinstance(value, Tracer):
@@ -102,6 +110,8 @@ def _refuse(m: mjx.Model) -> None:
     options = {
         "disableflags": m.opt.disableflags,
         "integrator": m.opt.integrator,
+        "enableflags": m.opt.enableflags,
+        "disableactuator": private.disableactuator,
         "density": float(private.has_fluid_params),
         "viscosity": 0.0,
     }
@@ -110,10 +120,33 @@ def _refuse(m: mjx.Model) -> None:
         "dof_frictionloss": m._impl.dof_hasfrictionloss,  # type: ignore[union-attr]
         "body_gravcomp": np.array(m.ngravcomp),
         "jnt_stiffness": np.zeros(m.njnt),  # taken
-        "actuator_damping": np.zeros(m.nu),  # `mjx.put_model` does not read them
-        "actuator_dampingpoly": np.zeros(m.nu),
+        "actuator_delay": np.zeros(m.nu),  # `mjx.put_model` drops it, but for the buffer's size
+        "actuator_dampingpoly": np.zeros(m.nu),  # dropped
+        "nplugin": m.npluginstate,
     }
     refuse_unsupported(SimpleNamespace(**view))  # type: ignore[arg-type]
+
+
+def _refuse_hidden_armature(m: mjx.Model, model: ChainModel) -> None:
+    """Refuse actuators' armature, which `mjx.put_model` drops: it is in `dof_M0`, the diagonal of
+    the mass matrix at the reference pose, which the compiler has stored.
+
+    Traced numbers cannot be compared, nor those of which `body_subtreemass` shows that the masses
+    are others than the compiled ones.
+    """
+    reference = [(0.0, 1.0)] * model.nq  # sine and cosine
+    diagonal = [row[-1] for row in dynamics.mass_matrix(model, reference)]
+    stored = m.body_mass, m.body_subtreemass, m.dof_M0
+    if any(isinstance(x, Tracer) for x in (*diagonal, *stored)):
+        return
+    if not np.allclose(m.body_subtreemass[0], np.sum(m.body_mass), rtol=1e-5):
+        return
+    require(
+        np.allclose(diagonal, m.dof_M0, rtol=1e-4),  # sums of float32 numbers, rounded at 6e-8 each
+        "mjx_step: dof_M0 is not that of the masses: actuators have armature, which mjx.put_model "
+        "drops, or numbers were changed after compilation; put the model with "
+        "mcx_jax.mjx_step.put_model",
+    )
 
 
 def _numbers(leaf: Any) -> tuple[Scalar, ...]:

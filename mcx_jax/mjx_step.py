@@ -1,18 +1,25 @@
 """`mjx.step` for serial hinge arms, computed by the chain engine: change one import.
 
     from mcx_jax.mjx_step import step
+    m = mcx_jax.mjx_step.put_model(mj)  # or mjx.put_model
 
 The model's numbers are read from `mjx.Model` while tracing. What is concrete (a model closed over,
 the usual case) becomes Python floats, whose zeros and ones vanish from the program; what is traced
 (a model that is an argument of `jit`, masses randomised by `vmap`) stays traced: right, but slower.
 """
 
+import copy
+
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from jax.core import Tracer
 
 from mcx_jax.envs import dynamics
+from mcx_jax.envs.fields import refuse_unsupported
+from mcx_jax.envs.model import with_joints_carrying_servos
+from mcx_jax.errors import UserError, reason
 from mcx_jax.mjx_model import Arm, compose, read
 from mcx_jax.quiet_mjx import mjx
 from mcx_jax.spatial import (
@@ -31,6 +38,25 @@ from mcx_jax.spatial import (
     vscale,
     vsub,
 )
+
+
+def put_model(mj: mujoco.MjModel) -> mjx.Model:
+    """`mjx.put_model` of a serial arm, without loss: the armature and damping of actuators, which
+    MJX drops, become their joints'.
+
+    Raises:
+        UserError: the model has something that the chain engine does not model (springs of joints
+            it takes here), or MJX does not take it.
+    """
+    springless = copy.copy(mj)
+    springless.jnt_stiffness[:] = 0.0
+    refuse_unsupported(springless)
+    whole = with_joints_carrying_servos(mj)
+    mujoco.mj_setConst(whole, mujoco.MjData(whole))  # `read` compares dof_M0
+    try:
+        return mjx.put_model(whole)
+    except NotImplementedError as error:
+        raise UserError(f"MJX cannot take this arm model: {reason(error)}") from None
 
 
 def step(m: mjx.Model, d: mjx.Data) -> mjx.Data:
@@ -52,7 +78,8 @@ def step(m: mjx.Model, d: mjx.Data) -> mjx.Data:
     Raises:
         UserError: the model is not a serial arm of hinges, or has something else that the chain
             engine does not model (contacts, active limits, ...). Numbers that are traced cannot be
-            looked at: polynomial stiffness and damping are then ignored, as `mjx.step` does.
+            looked at: polynomial stiffness and damping are then ignored, as `mjx.step` does. So is
+            damping of actuators in a model that `mjx.put_model` has made: it is not in there.
     """
     arm = read(m)
     n = arm.model.nq

@@ -59,13 +59,14 @@ SIX = (
        <body pos=".03 0 .1" quat=".8 .1 .1 .6"><geom mass=".4" pos=".02 .01 .03"/></body>
 </body></body></body></body></body></body></worldbody>
 <actuator>
- <position joint="a" kp="2000" kv="120" forcerange="-200 150"/>
+ <position joint="a" kp="2000" kv="120" armature=".3" damping="2" forcerange="-200 150"/>
  <position joint="b" kp="3000" forcerange="-250 250" ctrlrange="-2 2"/>
- <velocity joint="b" kv="80" ctrlrange="-1 1"/>
- <position joint="c" kp="900" kv="30" gear="-1.5" forcerange="-40 60"/>
+ <velocity joint="b" kv="80" ctrlrange="-1 1" damping="1.5"/>
+ <position joint="c" kp="900" kv="30" gear="-1.5" forcerange="-40 60" armature=".2"/>
  <motor joint="d" gear="10" ctrlrange="-1 1" forcerange="-.7 .7"/>
  <general joint="e" gainprm="40" biastype="affine" biasprm="1 -25 -3" forcerange="-15 20"/>
- <velocity joint="f" kv="4" forcerange="-3 5"/>
+ <velocity joint="f" kv="4" forcerange="-3 5" armature=".01" damping=".1"/>
+ <motor joint="f" gear="-.5" armature=".02" damping=".3"/>
 </actuator></mujoco>"""
 )
 

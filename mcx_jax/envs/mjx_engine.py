@@ -5,7 +5,6 @@ torque of the moving frame on every body (`xfrc_applied`), computed from MJX's o
 velocities and inertias, so the two engines check each other.
 """
 
-import copy
 from collections.abc import Callable
 
 import jax
@@ -15,6 +14,7 @@ import numpy as np
 from jax import lax
 
 from mcx_jax.envs.dynamics import BaseState
+from mcx_jax.envs.model import with_joints_carrying_servos
 from mcx_jax.quiet_mjx import mjx
 
 INTEGRATORS = {
@@ -26,7 +26,7 @@ INTEGRATORS = {
 
 def put_model(mj: mujoco.MjModel, integrator: str) -> mjx.Model:
     """The model on the device: zero gravity, wanted integrator, no contact or constraint work."""
-    mj = copy.copy(mj)
+    mj = with_joints_carrying_servos(mj)
     mj.opt.gravity[:] = 0.0
     mj.opt.integrator = INTEGRATORS[integrator]
     mj.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)

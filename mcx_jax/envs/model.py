@@ -6,6 +6,7 @@ parallel or perpendicular (nearly all) that constant is a signed permutation, wh
 vanish from the traced program.
 """
 
+import copy
 import os
 import sys
 from dataclasses import dataclass
@@ -15,10 +16,15 @@ import mujoco
 import numpy as np
 
 from mcx_jax.assets import asset_path
+from mcx_jax.envs.fields import integrator, moving_ancestor, refuse_unsupported
 from mcx_jax.errors import UserError
 from mcx_jax.spatial import ZERO, Mat, Scalar, Vec, snap
 
 ARMS = {"paper": "ur10e_paper.xml", "ur10e": "ur10e.xml"}
+
+
+SEVERAL = -2
+"""`jnt_actuatorid` of a joint with several actuators that have armature or damping."""
 
 
 @dataclass(frozen=True)
@@ -36,9 +42,9 @@ class Link:
     inertia: tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]
     """About the link frame's origin: xx, yy, zz, xy, xz, yz, kg m2."""
     armature: float
-    """Reflected rotor inertia, kg m2."""
+    """Reflected rotor inertia, of actuators as well, kg m2."""
     damping: float
-    """N m s/rad."""
+    """Of the joint and of what actuators have besides their bias, N m s/rad."""
     q_ref: float
     """Joint angle of the model's reference pose (MJCF `ref`), rad."""
     q_range: tuple[float, float]
@@ -122,6 +128,7 @@ def chain_model(mj: mujoco.MjModel, tool_site: str | None = None) -> ChainModel:
         UserError: the model has something that the chain engine does not model; says what.
     """
     refuse_unsupported(mj)
+    mj = with_joints_carrying_servos(mj)
     bodies = [int(b) for b in mj.jnt_bodyid]
     frames = [_link_frame(mj, j) for j in range(mj.njnt)]
     world = _reference_poses(mj)
@@ -133,78 +140,27 @@ def chain_model(mj: mujoco.MjModel, tool_site: str | None = None) -> ChainModel:
         site_rotation=_mat(rotation),
         site_position=_vec(position),
         timestep_s=float(mj.opt.timestep),
-        integrator={0: "euler", 3: "implicitfast"}[int(mj.opt.integrator)],
+        integrator=integrator(mj),
         gravity=ZERO
         if mj.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
         else _vec(mj.opt.gravity),
     )
 
 
-def refuse_unsupported(mj: mujoco.MjModel) -> None:
-    """Raise a UserError naming the first thing that the chain engine does not model."""
-    disabled = int(mj.opt.disableflags)
-    off = mujoco.mjtDisableBit
-    constraints = not disabled & off.mjDSBL_CONSTRAINT
-    contacts = constraints and not disabled & off.mjDSBL_CONTACT
-    limits = constraints and not disabled & off.mjDSBL_LIMIT
-    collidable = bool(np.any(mj.geom_contype[:, None] & mj.geom_conaffinity[None, :]))
-    serial = all(
-        mj.body_parentid[b] == 0 or _moving_ancestor(mj, b) == mj.jnt_bodyid[j - 1]
-        for j, b in enumerate(mj.jnt_bodyid)
-        if j > 0
-    )
-    joint_actuators = bool(np.all(mj.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT))
-    fixed_gain = bool(np.all(mj.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED))
-    plain_bias = bool(
-        np.all(
-            np.isin(
-                mj.actuator_biastype, [mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtBias.mjBIAS_AFFINE]
-            )
-        )
-    )
-    faults = {
-        "no joints": mj.njnt == 0,
-        "joints that are not hinges": bool(np.any(mj.jnt_type != mujoco.mjtJoint.mjJNT_HINGE)),
-        "more than one joint on a body": len(set(mj.jnt_bodyid.tolist())) < mj.njnt,
-        "a branching (not serial) tree": not serial
-        or sum(_moving_ancestor(mj, int(b)) == 0 for b in mj.jnt_bodyid) > 1,
-        'contacts (disable them with <flag contact="disable"/>)': contacts and collidable,
-        'active joint limits (disable them with <flag limit="disable"/>)': limits
-        and bool(np.any(mj.jnt_limited)),
-        "equality constraints": constraints and mj.neq > 0,
-        "dry joint friction (frictionloss)": constraints and bool(np.any(mj.dof_frictionloss)),
-        "joint springs (stiffness)": bool(np.any(mj.jnt_stiffness) or np.any(mj.jnt_stiffnesspoly)),
-        "non-linear joint damping": bool(np.any(mj.dof_dampingpoly)),
-        "actuator damping": bool(np.any(mj.actuator_damping) or np.any(mj.actuator_dampingpoly)),
-        "disabled dampers, actuation or implicit damping": bool(
-            disabled & (off.mjDSBL_DAMPER | off.mjDSBL_ACTUATION | off.mjDSBL_EULERDAMP)
-        ),
-        "gravity compensation": bool(np.any(mj.body_gravcomp)),
-        "joint-level actuator force limits": bool(np.any(mj.jnt_actfrclimited)),
-        "tendons": mj.ntendon > 0,
-        "fluid forces": mj.opt.density != 0 or mj.opt.viscosity != 0,
-        "mocap bodies": mj.nmocap > 0,
-        "actuators that do not act on a joint": not joint_actuators,
-        "actuators with internal dynamics": mj.na > 0,
-        "actuators with a gain or bias that is not constant/affine": not (
-            fixed_gain and plain_bias
-        ),
-        "an integrator other than Euler or implicitfast": int(mj.opt.integrator) not in (0, 3),
-    }
-    for fault, present in faults.items():
-        if present:
-            raise UserError(
-                f"the chain engine cannot take this arm model: it has {fault}; "
-                "take that out of the MJCF file"
-            )
-
-
-def _moving_ancestor(mj: mujoco.MjModel, body: int) -> int:
-    """The nearest ancestor with a joint, or 0 (the world)."""
-    body = int(mj.body_parentid[body])
-    while body and mj.body_jntnum[body] == 0:
-        body = int(mj.body_parentid[body])
-    return body
+def with_joints_carrying_servos(mj: mujoco.MjModel) -> mujoco.MjModel:
+    """A copy in which the rotors' inertia and damping that actuators add to their joints, gear
+    squared times their own, are the joints'. MuJoCo adds them in each step; MJX drops them."""
+    mj = copy.copy(mj)
+    for i in range(mj.nu):
+        joint = mj.actuator_trnid[i, 0]
+        if mj.jnt_actuatorid[joint] not in (i, SEVERAL):
+            continue  # the compiler saw none: C MuJoCo does not look either
+        dof, gear_squared = mj.jnt_dofadr[joint], mj.actuator_gear[i, 0] ** 2
+        mj.dof_armature[dof] += gear_squared * mj.actuator_armature[i]
+        mj.dof_damping[dof] += gear_squared * mj.actuator_damping[i]
+    mj.actuator_armature[:] = mj.actuator_damping[:] = 0.0
+    mj.jnt_actuatorid[:] = -1
+    return mj
 
 
 def _reference_poses(mj: mujoco.MjModel) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -272,7 +228,7 @@ def _mass_properties(mj, body: int, frame, world) -> tuple[float, np.ndarray, np
     """Mass, first moment and inertia about `frame`'s origin of a body and all welded to it."""
     mass, moment, inertia = 0.0, np.zeros(3), np.zeros((3, 3))
     for b in range(1, mj.nbody):
-        if not (b == body or (mj.body_jntnum[b] == 0 and _moving_ancestor(mj, b) == body)):
+        if not (b == body or (mj.body_jntnum[b] == 0 and moving_ancestor(mj, b) == body)):
             continue
         m = float(mj.body_mass[b])
         com = _compose(world[b], (_matrix(mj.body_iquat[b]), mj.body_ipos[b]))
@@ -293,7 +249,7 @@ def _site(mj, name: str | None, last_body: int, frame, world):
             f"--tool-site {name}: the arm model's sites are: {', '.join(names) or 'none'}"
         )
     body = int(mj.site_bodyid[site])
-    if body != last_body and _moving_ancestor(mj, body) != last_body:
+    if body != last_body and moving_ancestor(mj, body) != last_body:
         raise UserError(f"--tool-site {name}: it must be on the last link of the chain")
     pose = _compose(world[body], (_matrix(mj.site_quat[site]), mj.site_pos[site]))
     return _relative(_compose(world[last_body], frame), pose)
