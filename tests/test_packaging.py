@@ -1,9 +1,11 @@
 """What is shipped: the wheel, the pinned versions, no trace of the machine it was made on."""
 
+import functools
 import importlib.metadata
 import importlib.util
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -96,6 +98,41 @@ def test_ci_runs_make_test(repo_root):
     script = repo_root / ".ci" / "run"
     assert os.access(script, os.X_OK)
     assert "make test" in script.read_text(encoding="utf-8")
+
+
+def test_ci_installs_what_is_missing_or_says_so(repo_root, tmp_path):
+    """With an apt-get and a make of our own, and a search path without a browser."""
+    tools = tmp_path / "bin"
+    tools.mkdir()
+    scripts = {
+        "apt-get": f'echo "$@" >> {tmp_path}/apt; exit "${{APT:-0}}"',
+        "make": f'echo "$@" CI=$CI >> {tmp_path}/make',
+        "ldconfig": "exit 0",
+        "sudo": 'shift; exec "$@"',
+    }
+    for name, text in scripts.items():
+        (tools / name).write_text(f"#!/bin/sh\n{text}\n")
+        (tools / name).chmod(0o755)
+    for name in ("bash", "dirname", "env", "sh"):
+        (tools / name).symlink_to(shutil.which(name))
+    call = functools.partial(
+        subprocess.run, [repo_root / ".ci" / "run"], capture_output=True, text=True, check=False
+    )
+    done = call(env={"PATH": str(tools)})
+    assert done.returncode == 0, done.stderr
+    said = (tmp_path / "apt").read_text().splitlines()
+    assert said == [
+        "update -qq",
+        "install -y -qq --no-install-recommends chromium libosmesa6",
+    ]
+    assert (tmp_path / "make").read_text() == "test CI=true\n"
+    refused = call(env={"PATH": str(tools), "APT": "100"})
+    assert refused.returncode == 1
+    assert refused.stderr.startswith("error: the tests need chromium libosmesa6 (Debian's names)")
+    for name, text in {"chromium": "", "ldconfig": "echo libOSMesa.so.8"}.items():
+        (tools / name).write_text(f"#!/bin/sh\n{text}\n")
+        (tools / name).chmod(0o755)
+    assert call(env={"PATH": str(tools), "APT": "100"}).returncode == 0
 
 
 @pytest.fixture(scope="module")

@@ -16,8 +16,7 @@ from packaging.requirements import Requirement
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs" / "licences.md"
 EXTRAS = ("gym", "export", "viz")
-"""Beside `runtime`: the extras that users install. What of them is not in constraints.txt (viser
-and imageio, of viz) is not in the table."""
+"""Beside `runtime`: the extras that users install."""
 MARKERS = {"python_version": "3.11", "python_full_version": "3.11.7", "sys_platform": "linux"} | {
     "platform_system": "Linux",
     "platform_machine": "x86_64",
@@ -41,8 +40,8 @@ What mcx_jax (Apache-2.0) needs to run, with the versions of `constraints.txt`; 
 `python tools/licences.py` from the packages' own metadata, checked by `tests/test_packaging.py`.
 None is under the GPL or AGPL.
 
-Not in the table: `viser` and `imageio[ffmpeg]` of the extra `viz`, which no constraint pins (the
-latter brings an FFmpeg program of its own, under the GPL); `sb3` and `cuda`; `hydro`, whose
+`imageio-ffmpeg` brings an FFmpeg program of its own, which is under the GPL and runs as a process
+of its own. Not in the table: `sb3` and `cuda`; `hydro`, whose
 Capytaine is under the GPL and only remakes a data file (`tools/hydro`): nothing in `mcx_jax`
 imports it. Wheels may hold libraries with licences of their own, such as the Fortran run-time
 library in SciPy's: see the packages.
