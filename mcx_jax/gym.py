@@ -6,15 +6,22 @@
     one = gymnasium.make("mcx_jax/V2V-v0", delay="E2", sea="Wd")
     many = gymnasium.make_vec("mcx_jax/V2V-v0", num_envs=512, delay="E2")
 
-Settings are those of `EnvConfig` and `MotionConfig` by name; `test=True` takes the motion that
-training never sees. Observation: (38,) float32, `envs.observe.OBS_TABLE`, m and rad. Action: (6,)
-float32, the goal moved in its own axes, 3 cm and 3 crad (rotation vector), within `max_correction`,
-which also the task applies. Reward: -(dp + da) in m and rad. `info`: `dp_mm`, `da_mrad`, `valid`.
+Settings are those of `EnvConfig`, `ConditionsConfig` and `MotionConfig` by name (`noise_mm="1"`);
+`test=True` takes the motion that training never sees. Observation: (38,) float32,
+`envs.observe.OBS_TABLE`, m and rad. Action: (6,) float32, the goal moved in its own axes, 3 cm and
+3 crad (rotation vector), within `max_correction`, which also the task applies. Reward: -(dp + da)
+in m and rad. `info`: `dp_mm`, `da_mrad`, `valid`.
 
 An episode is never terminated, only truncated, by the time limit or as soon as it is invalid (the
 IK failed, the tool is half a metre off, the arm diverged). All rewards are negative: a terminated
 failure would be worth more than tracking on. A state that is not finite is never shown: observation
 and reward are then those of the step before.
+
+An episode ends at the earlier of `episode_steps` (1000), which also decides where windows of motion
+begin, and Gymnasium's own `max_episode_steps` (registered: 1000). A longer one needs both.
+
+`render_mode="rgb_array"` draws as `mcx_jax.play` does (extra `viz`, off-screen OpenGL); `render` of
+many gives one picture for each.
 
 Episode n of seed s begins with the key `fold_in(key(s), n)`, alone and among many.
 """
@@ -22,6 +29,7 @@ Episode n of seed s begins with the key `fold_in(key(s), n)`, alone and among ma
 import dataclasses
 from collections.abc import Sequence
 from functools import cache, partial
+from importlib.util import find_spec
 from typing import Any, Literal, get_type_hints
 
 try:
@@ -39,13 +47,17 @@ from gymnasium.vector.utils import batch_space
 
 from mcx_jax.cli import checked_value
 from mcx_jax.delay import CONTROL_DT_S
-from mcx_jax.env_config import EnvConfig, MotionConfig
+from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
 from mcx_jax.envs.state import EnvState
 from mcx_jax.envs.v2v import V2VEnv, make_env
 from mcx_jax.errors import UserError
 from mcx_jax.playground import finite_step
 
 ENV_ID = "mcx_jax/V2V-v0"
+REGISTERED_STEPS = EnvConfig().episode_steps
+"""`max_episode_steps` of the registered spec."""
+NO_LIMIT = 2**31 - 1
+RENDER_MODES = ("rgb_array",)
 
 
 @struct.dataclass
@@ -70,9 +82,29 @@ def _reset(env: V2VEnv, seeds: jax.Array, episodes: jax.Array) -> tuple[EnvState
 
 
 @jax.jit
-def _step(env: V2VEnv, state: EnvState, actions: jax.Array) -> tuple[EnvState, Told]:
+def _step(
+    env: V2VEnv, state: EnvState, actions: jax.Array, limit: jax.Array
+) -> tuple[EnvState, Told]:
     state = jax.vmap(partial(finite_step, env), in_axes=-1, out_axes=-1)(state, actions.T)
-    return state, _tell(state)
+    told = _tell(state)
+    return state, dataclasses.replace(told, truncated=told.truncated | (state.step >= limit))
+
+
+def _checked(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Actions as float32.
+
+    Raises:
+        UserError: another shape, no numbers, or not finite ones.
+    """
+    try:
+        array = np.asarray(actions, np.float32)
+    except (TypeError, ValueError):
+        raise UserError(f"action: must be an array of numbers, shape {shape}") from None
+    if array.shape != shape:
+        raise UserError(f"action of shape {array.shape}: must have shape {shape}, cm and crad")
+    if not np.isfinite(array).all():
+        raise UserError("action is NaN or infinite: must be finite numbers, cm and crad")
+    return array
 
 
 @jax.jit
@@ -94,12 +126,17 @@ def _tell(state: EnvState) -> Told:
 class Episodes:
     """N environments and the episode that each is in; NumPy outside, one program each inside."""
 
-    def __init__(self, env: V2VEnv, count: int) -> None:
-        """Nothing is computed before the first reset."""
-        self.env = env
+    def __init__(self, settings: "_Settings", count: int, limit: int = NO_LIMIT) -> None:
+        """Nothing is computed before the first reset.
+
+        Args:
+            limit: control steps after which an episode is truncated; its own end may be earlier.
+        """
+        self.settings, self.env, self.limit = settings, settings.task, np.int32(limit)
         self.state: EnvState | None = None
         self.seeds = np.zeros(count, np.uint32)
         self.numbers = np.full(count, -1, np.int32)
+        self._live: Any = None
 
     def seed(self, seeds: Sequence[int | None], rng: np.random.Generator) -> None:
         """Start again from episode 0 of these seeds.
@@ -125,12 +162,38 @@ class Episodes:
         return _to_numpy(told)
 
     def step(self, actions: np.ndarray) -> Told:
-        """One control step of all; actions (N, 6), cm and crad."""
+        """One control step of all; actions (N, 6) float32, cm and crad."""
         if self.state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
-        actions = np.asarray(actions, np.float32)
-        self.state, told = _step(self.env, self.state, actions)
+        self.state, told = _step(self.env, self.state, actions, self.limit)
         return _to_numpy(told)
+
+    def pictures(self) -> tuple[np.ndarray, ...]:
+        """What each looks like now, (360, 640, 3) uint8.
+
+        Raises:
+            UserError: the extra `viz` is missing, or no off-screen OpenGL works.
+        """
+        if self.state is None:
+            raise gymnasium.error.ResetNeeded("call reset before render")
+        if self._live is None:
+            self._live = _live(self.settings, self.env)
+        return self._live.pictures(self.state)
+
+    def close(self) -> None:
+        """Give the renderer back, if there is one."""
+        if self._live is not None:
+            self._live.close()
+            self._live = None
+
+
+def _live(settings: "_Settings", env: V2VEnv):
+    """The renderer, which only `render` needs."""
+    if find_spec("PIL") is None:
+        raise UserError("render needs pillow: pip install 'mcx_jax[viz]'")
+    from mcx_jax.play.live import Live
+
+    return Live(env, settings.motion, settings.split)
 
 
 def _to_numpy(told: Told) -> Told:
@@ -144,19 +207,41 @@ def _task(env: EnvConfig, motion: MotionConfig, split: Literal["train", "test"])
     return dataclasses.replace(make_env(env, motion, split=split), whole_batches=True)
 
 
-def _make_task(test: bool, settings: dict[str, Any]) -> V2VEnv:
-    configs = []
-    for config in (EnvConfig, MotionConfig):
-        hints = get_type_hints(config)
-        given = {k: settings.pop(k) for k in hints if k in settings}
-        checked = {k: checked_value(hints[k], x, f"setting {k}") for k, x in given.items()}
-        configs.append(config(**checked))
+@dataclasses.dataclass(frozen=True)
+class _Settings:
+    """What the keywords of an environment say."""
+
+    env: EnvConfig
+    motion: MotionConfig
+    split: Literal["train", "test"]
+
+    @property
+    def task(self) -> V2VEnv:
+        return _task(self.env, self.motion, self.split)
+
+
+def _read(test: bool, settings: dict[str, Any]) -> _Settings:
+    """The settings by their plain names, whichever dataclass they are a field of."""
+    conditions, env = _fields(ConditionsConfig, settings), _fields(EnvConfig, settings)
+    motion = _fields(MotionConfig, settings)
     if settings:
         raise UserError(
-            f"unknown setting {next(iter(settings))!r}: use test or a field of EnvConfig or "
-            "MotionConfig"
+            f"unknown setting {next(iter(settings))!r}: use test or a field of EnvConfig, "
+            "ConditionsConfig or MotionConfig"
         )
-    return _task(*configs, "test" if test else "train")
+    if conditions and "conditions" in env:
+        raise UserError(f"settings conditions and {next(iter(conditions))}: give one of them")
+    if conditions:
+        env["conditions"] = ConditionsConfig(**conditions)
+    split = "test" if checked_value(bool, test, "setting test") else "train"
+    return _Settings(EnvConfig(**env), MotionConfig(**motion), split)
+
+
+def _fields(config: type, settings: dict[str, Any]) -> dict[str, Any]:
+    """Those of the settings that are fields of a dataclass, checked; taken out of `settings`."""
+    hints = get_type_hints(config)
+    given = {k: settings.pop(k) for k in hints if k in settings}
+    return {k: checked_value(hints[k], x, f"setting {k}") for k, x in given.items()}
 
 
 def _spaces(env: V2VEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
@@ -168,42 +253,102 @@ def _spaces(env: V2VEnv) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     )
 
 
+def _checked_mode(render_mode: str | None) -> str | None:
+    if render_mode not in (None, *RENDER_MODES):
+        raise UserError(f"render_mode {render_mode!r}: use {', '.join(RENDER_MODES)} or None")
+    return render_mode
+
+
+def _no_options(options: dict[str, Any] | None) -> None:
+    if options:
+        raise UserError(f"reset takes no options, not {next(iter(options))!r}")
+
+
 class V2V(gymnasium.Env[np.ndarray, np.ndarray]):
     """One environment (see the module)."""
 
-    metadata = {"render_modes": [], "render_fps": round(1 / CONTROL_DT_S)}
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": round(1 / CONTROL_DT_S)}
 
     def __init__(
         self, *, test: bool = False, render_mode: str | None = None, **settings: Any
     ) -> None:
-        """Settings: fields of EnvConfig and MotionConfig.
+        """Settings: fields of EnvConfig, ConditionsConfig and MotionConfig.
 
         Args:
             test: the motion that training never sees.
-            render_mode: without effect, as nothing is drawn; learners' helpers pass one unasked.
+            render_mode: "rgb_array", or None for no pictures. Nothing is loaded before `render`.
 
         Raises:
             UserError: an unknown or impossible setting.
         """
-        del render_mode
-        env = _make_task(test, settings)
-        self.observation_space, self.action_space = _spaces(env)
-        self._episodes = Episodes(env, 1)
+        self.render_mode = _checked_mode(render_mode)
+        self._episodes = Episodes(_read(test, settings), 1)
+        self._taken = 0
+        self._shape = (self._episodes.env.action_size,)
+        self.observation_space, self.action_space = _spaces(self._episodes.env)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """(observation, info) of episode 0 of `seed`, or of the next episode. No options."""
         super().reset(seed=seed)
+        _no_options(options)
+        self._check_limit()
         self._episodes.seed([seed], self.np_random)
         told = self._episodes.reset(np.array([True]))
+        self._taken = 0
         return told.obs[0], _first(told.info)
 
+    def _check_limit(self) -> None:
+        """Nothing tells an environment that `gymnasium.make` cuts its episodes short; a reset after
+        as many steps as are registered does."""
+        steps = self._episodes.env.episode_steps
+        if self._taken == REGISTERED_STEPS < steps:
+            raise UserError(_beyond(steps, REGISTERED_STEPS))
+
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """(observation, reward, False, truncated, info) after 20 ms."""
-        told = self._episodes.step(np.asarray(action)[None])
+        """(observation, reward, False, truncated, info) after 20 ms; action (6,)."""
+        told = self._episodes.step(_checked(action, self._shape)[None])
+        self._taken += 1
         reward, truncated = float(told.reward[0]), bool(told.truncated[0])
         return told.obs[0], reward, False, truncated, _first(told.info)
+
+    def render(self) -> np.ndarray | None:
+        """(360, 640, 3) uint8: the scene now; None without a render mode, as Gymnasium has it."""
+        return self._episodes.pictures()[0] if self.render_mode else None
+
+    def close(self) -> None:
+        """Give the renderer back."""
+        self._episodes.close()
+
+
+def _beyond(steps: int, limit: int) -> str:
+    return (
+        f"episode_steps {steps}, but Gymnasium cuts an episode at max_episode_steps {limit}: give "
+        f"both, max_episode_steps={steps}"
+    )
+
+
+def _limit(max_episode_steps: int | None, settings: dict[str, Any]) -> int:
+    """Control steps after which many environments are truncated, from what `make_vec` passes on.
+
+    Raises:
+        UserError: episodes would silently be shorter than asked for.
+    """
+    if max_episode_steps is None or max_episode_steps == -1:
+        return NO_LIMIT
+    limit = checked_value(int, max_episode_steps, "max_episode_steps")
+    if limit < 1:
+        raise UserError(f"max_episode_steps {limit}: must be positive, or -1 for none")
+    steps = settings.get("episode_steps")
+    if type(steps) is int and limit == REGISTERED_STEPS < steps:
+        raise UserError(_beyond(steps, limit))
+    if steps is None and limit > REGISTERED_STEPS:
+        raise UserError(
+            f"max_episode_steps {limit}, but an episode has episode_steps {REGISTERED_STEPS}: give "
+            f"both, episode_steps={limit}"
+        )
+    return limit
 
 
 def _first(info: dict[str, np.ndarray]) -> dict[str, Any]:
@@ -215,20 +360,40 @@ class V2VVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     An environment whose episode ends is reset in the same step: its observation and info are those
     of the new episode, the last ones of the old are `info["final_obs"]` and `info["final_info"]`.
+    With `autoreset_mode="NextStep"`, which Gymnasium's wrappers of observations need, in the step
+    after it, whose action is not used and whose reward is 0.
     """
 
     metadata = {**V2V.metadata, "autoreset_mode": AutoresetMode.SAME_STEP}
 
-    def __init__(self, num_envs: int = 1, *, test: bool = False, **settings: Any) -> None:
-        """As `V2V`, `num_envs` of them."""
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        test: bool = False,
+        render_mode: str | None = None,
+        max_episode_steps: int | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        **settings: Any,
+    ) -> None:
+        """As `V2V`, `num_envs` of them.
+
+        Args:
+            autoreset_mode: "SameStep" or "NextStep".
+            max_episode_steps: an earlier end than `episode_steps`; -1 or None: none.
+        """
         if num_envs < 1:
             raise UserError(f"num_envs {num_envs}: must be a positive integer")
         self.num_envs = num_envs
-        env = _make_task(test, settings)
-        self.single_observation_space, self.single_action_space = _spaces(env)
+        self.render_mode = _checked_mode(render_mode)
+        self.metadata = {**self.metadata, "autoreset_mode": _autoreset(autoreset_mode)}
+        self._next_step = self.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+        self._ended = np.zeros(num_envs, bool)
+        limit = _limit(max_episode_steps, settings)
+        self._episodes = Episodes(_read(test, settings), num_envs, limit)
+        self.single_observation_space, self.single_action_space = _spaces(self._episodes.env)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._episodes = Episodes(env, num_envs)
 
     def reset(
         self,
@@ -237,12 +402,15 @@ class V2VVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         options: dict[str, Any] | None = None,
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """(observations, infos); an integer seeds environment i with seed + i. No options."""
-        if seed is None or isinstance(seed, int):
+        _no_options(options)
+        if seed is None or isinstance(seed, int | np.integer):
+            seed = None if seed is None else int(seed)
             super().reset(seed=seed)
             seed = [None if seed is None else seed + i for i in range(self.num_envs)]
         if len(seed) != self.num_envs:
             raise UserError(f"{len(seed)} seeds for {self.num_envs} environments")
         self._episodes.seed(seed, self.np_random)
+        self._ended[:] = False
         everyone = np.ones(self.num_envs, bool)
         told = self._episodes.reset(everyone)
         return told.obs, _masked(told.info, everyone)
@@ -251,26 +419,56 @@ class V2VVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """(observations, rewards, terminated, truncated, infos) after 20 ms; actions (N, 6)."""
-        told = self._episodes.step(actions)
-        ended = told.truncated
-        info = _masked(told.info, np.ones(self.num_envs, bool))
-        obs = told.obs
-        if ended.any():
-            obs, info = self._renew(told)
-        return obs, told.reward, np.zeros_like(ended), ended, info
+        shape = self.num_envs, self._episodes.env.action_size
+        told, final = self._episodes.step(_checked(actions, shape)), {}
+        if self._next_step:
+            told = self._begin(self._ended, told)
+            self._ended = ended = told.truncated
+        elif (ended := told.truncated).any():
+            final = _final(told)
+            told = self._begin(ended, told)
+        info = _masked(told.info, np.ones(self.num_envs, bool)) | final
+        return told.obs, told.reward, np.zeros_like(ended), ended, info
 
-    def _renew(self, told: Told) -> tuple[np.ndarray, dict[str, Any]]:
-        """Next episodes where one has ended: observations and infos."""
-        ended = told.truncated
-        fresh = self._episodes.reset(ended)
-        final_obs = np.full(self.num_envs, None, object)
-        for i in np.flatnonzero(ended):
-            final_obs[i] = told.obs[i]
-        values = {k: np.where(ended, fresh.info[k], v) for k, v in told.info.items()}
-        last = {k: np.where(ended, v, np.zeros_like(v)) for k, v in told.info.items()}
-        ends = {"final_obs": final_obs, "final_info": _masked(last, ended)}
-        info = _masked(values, np.ones(self.num_envs, bool)) | _masked(ends, ended)
-        return np.where(ended[:, None], fresh.obs, told.obs), info
+    def _begin(self, mask: np.ndarray, told: Told) -> Told:
+        """`told`, with the next episodes where `mask` says so. A reward stays that of the step if
+        the episode ended in it."""
+        if not mask.any():
+            return told
+        fresh = self._episodes.reset(mask)
+        return Told(
+            obs=np.where(mask[:, None], fresh.obs, told.obs),
+            reward=np.where(mask & self._next_step, 0, told.reward),
+            truncated=told.truncated & ~mask,
+            info={k: np.where(mask, fresh.info[k], v) for k, v in told.info.items()},
+        )
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """One picture for each environment, (360, 640, 3) uint8; None without a render mode."""
+        return self._episodes.pictures() if self.render_mode else None
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Give the renderer back."""
+        self._episodes.close()
+
+
+def _autoreset(mode: AutoresetMode | str) -> AutoresetMode:
+    allowed = AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP
+    names = {name.value: name for name in allowed}
+    found = mode if mode in allowed else names.get(str(mode))
+    if found is None:
+        raise UserError(f"autoreset_mode {mode!r}: use {' or '.join(names)}")
+    return AutoresetMode(found)
+
+
+def _final(told: Told) -> dict[str, Any]:
+    """Gymnasium's `final_obs` and `final_info`: the last of the episodes that have ended."""
+    ended = told.truncated
+    obs = np.full(len(ended), None, object)
+    for i in np.flatnonzero(ended):
+        obs[i] = told.obs[i]
+    last = {k: np.where(ended, v, np.zeros_like(v)) for k, v in told.info.items()}
+    return _masked({"final_obs": obs, "final_info": _masked(last, ended)}, ended)
 
 
 def _masked(info: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
@@ -279,5 +477,8 @@ def _masked(info: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
 
 
 gymnasium.register(
-    ENV_ID, entry_point="mcx_jax.gym:V2V", vector_entry_point="mcx_jax.gym:V2VVector"
+    ENV_ID,
+    entry_point="mcx_jax.gym:V2V",
+    vector_entry_point="mcx_jax.gym:V2VVector",
+    max_episode_steps=REGISTERED_STEPS,
 )

@@ -13,8 +13,6 @@ SETTINGS = {"delay": "E1", "sea": "Wa", "integrator": "implicitfast", "episode_s
 
 # SB3 recommends actions in [-1, 1]; ours are in cm and crad.
 @pytest.mark.filterwarnings("ignore:.*recommend.*symmetric and normalized:UserWarning")
-# Its helper asks for pictures.
-@pytest.mark.filterwarnings("ignore:.*initialised with render_mode='rgb_array':UserWarning")
 def test_ppo_trains():
     import torch
     from stable_baselines3.common.env_checker import check_env

@@ -95,9 +95,13 @@ def simulate(
     key = jax.random.split(jax.random.key(seed), EPISODES)[episode]
     both = side_by_side(env, controller, key, sea, _sample)
     names = ("ik",) if who == "ik" else ("ik", who)
-    delay = env.delays[int(both[0].delay[0])]
-    said = f"{delay.name} ({1e3 * delay.group_delay_s:.0f} ms)"
-    return Take(names, both[: len(names)], said, env.motion.seas[sea])
+    return Take(names, both[: len(names)], name_delay(env, both[0]), env.motion.seas[sea])
+
+
+def name_delay(env: V2VEnv, poses: Poses) -> str:
+    """The episode's delay and how late it makes slow motion: "E2 (40 ms)"."""
+    delay = env.delays[int(poses.delay[0])]
+    return f"{delay.name} ({1e3 * delay.group_delay_s:.0f} ms)"
 
 
 def vessel_poses(motion: Motion, track: Track, step: jax.Array):
@@ -109,6 +113,11 @@ def vessel_poses(motion: Motion, track: Track, step: jax.Array):
 
 def _sample(env: V2VEnv, before: EnvState, after: EnvState, action: jax.Array) -> Poses:
     del before, action
+    return poses_now(env, after)
+
+
+def poses_now(env: V2VEnv, after: EnvState) -> Poses:
+    """What is drawn of a state, without the axis of control steps."""
     track = after.track
     (r_a, p_a), (r_b, p_b) = vessel_poses(env.motion, track, after.step * SUBSTEPS)
     a_rotation, a_m = jnp.asarray(r_a), jnp.stack(p_a)

@@ -55,25 +55,17 @@ class Picture:
         count = len(self._take.names)
         width = (WIDTH_PX - GAP_PX * (count - 1)) // count
         for i in range(count):
-            self._panel(image, i, step, i * (width + GAP_PX), width)
+            image.paste(self._panel(i, step, width), (i * (width + GAP_PX), TITLE_PX))
         self._plot(draw, step)
         return np.asarray(image)
 
-    def _panel(self, image: Image.Image, i: int, step: int, left: int, width: int) -> None:
-        poses = self._take.poses[i]
+    def _panel(self, i: int, step: int, width: int) -> Image.Image:
+        poses, name = self._take.poses[i], self._take.names[i]
         self._stage.place(poses, step)
-        camera = "hero" if len(self._take.names) == 1 else "pair"
-        wide = Image.fromarray(self._painter.wide(width, PANEL_PX, camera))
-        image.paste(wide, (left, TITLE_PX))
-        top = TITLE_PX + 10
-        inset(image, self._painter.close_up(CLOSE_UP_PX), left + width - 10, top)
-        draw = ImageDraw.Draw(image)
-        name = self._take.names[i]
         label = "IK baseline" if name == "ik" else name
-        chip(draw, (left + 10, top), label, COLOURS[i], 22)
-        dp, da = 1e3 * poses.pos_error_m[step], 1e3 * poses.ang_error_rad[step]
-        chip(draw, (left + 10, top + 40), f"{dp:.2f} mm", INK, 20)
-        chip(draw, (left + 10, top + 78), f"{da:.2f} mrad", INK, 20)
+        camera = "hero" if len(self._take.names) == 1 else "pair"
+        errors = poses.pos_error_m[step], poses.ang_error_rad[step]
+        return panel(self._painter, (width, PANEL_PX), camera, (label, COLOURS[i]), errors)
 
     def _plot(self, draw: ImageDraw.ImageDraw, step: int) -> None:
         left, top, right, bottom = PLOT_BOX_PX
@@ -97,6 +89,28 @@ class Picture:
                 draw.line(line, COLOURS[i], 3, joint="curve")
             x, y = line[-1]
             draw.ellipse((x - 5, y - 5, x + 5, y + 5), fill=COLOURS[i])
+
+
+def panel(
+    painter: Painter,
+    size_px: tuple[int, int],
+    camera: str,
+    label: tuple[str, str],
+    errors: tuple[float, float],
+) -> Image.Image:
+    """The painter's stage as it is now: through a camera, close up, errors as numbers.
+
+    Args:
+        label: text and colour of the upper left plate.
+        errors: dp in m, da in rad.
+    """
+    image = Image.fromarray(painter.wide(*size_px, camera))
+    inset(image, painter.close_up(CLOSE_UP_PX), size_px[0] - 10, 10)
+    draw = ImageDraw.Draw(image)
+    chip(draw, (10, 10), *label, 22)
+    chip(draw, (10, 50), f"{1e3 * errors[0]:.2f} mm", INK, 20)
+    chip(draw, (10, 88), f"{1e3 * errors[1]:.2f} mrad", INK, 20)
+    return image
 
 
 def inset(image: Image.Image, close_up: np.ndarray, right: int, top: int) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from mcx_jax.assets import asset_path
 from mcx_jax.env_config import EnvConfig
 from mcx_jax.envs.model import ARMS
+from mcx_jax.play import gl
 from mcx_jax.play.episode import Poses
 from mcx_jax.play.waves import Surface
 from mcx_jax.scene import build_scene, pose_scene, sea_points_m, set_sea
@@ -54,7 +55,7 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
 
 
 class Painter:
-    """Pixels of a stage; needs `gl.choose()` before MuJoCo's first import. Use as a context."""
+    """Pixels of a stage. Use as a context, or `close` it."""
 
     def __init__(self, stage: Stage, width_px: int, height_px: int, *, fine: bool = False):
         """Args: the largest picture that will be asked for; fine = the scene file's quality."""
@@ -62,9 +63,8 @@ class Painter:
         if not fine:
             model.vis.quality.shadowsize, model.vis.quality.offsamples = FILM_QUALITY
         model.vis.global_.offwidth, model.vis.global_.offheight = width_px, height_px
-        self._stage = stage
-        self._gl = mujoco.GLContext(width_px, height_px)
-        self._gl.make_current()
+        self.stage = stage
+        self._gl = gl.context(width_px, height_px)
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._scene = mujoco.MjvScene(model, maxgeom=1000)
@@ -74,26 +74,30 @@ class Painter:
         return self
 
     def __exit__(self, *_) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give the context back."""
+        self._gl.make_current()
         self._context.free()
         self._gl.free()
 
     def upload_sea(self) -> None:
         """Tell the renderer that the stage's sea has changed."""
-        mujoco.mjr_uploadHField(
-            self._stage.model, self._context, self._stage.model.hfield("sea").id
-        )
+        self._gl.make_current()
+        mujoco.mjr_uploadHField(self.stage.model, self._context, self.stage.model.hfield("sea").id)
 
     def wide(self, width_px: int, height_px: int, camera: str) -> np.ndarray:
         """(height, width, 3) uint8 through one of the scene's cameras."""
         view = mujoco.MjvCamera()
         view.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        view.fixedcamid = self._stage.model.camera(camera).id
+        view.fixedcamid = self.stage.model.camera(camera).id
         return self._draw(view, width_px, height_px)
 
     def close_up(self, size_px: int) -> np.ndarray:
         """(size, size, 3) uint8: the goal in the middle."""
         view = mujoco.MjvCamera()
-        view.lookat = self._stage.data.body("goal").xpos
+        view.lookat = self.stage.data.body("goal").xpos
         view.distance, view.azimuth, view.elevation = CLOSE_UP
         # The arm's own shadow covers most of it, and a shadow costs as much again as the rest.
         return self._draw(view, size_px, size_px, shadow=False)
@@ -101,9 +105,10 @@ class Painter:
     def _draw(
         self, view: mujoco.MjvCamera, width_px: int, height_px: int, *, shadow: bool = True
     ) -> np.ndarray:
+        self._gl.make_current()  # another painter may have drawn in between
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = shadow
         every = mujoco.mjtCatBit.mjCAT_ALL.value
-        model, data = self._stage.model, self._stage.data
+        model, data = self.stage.model, self.stage.data
         mujoco.mjv_updateScene(model, data, self._option, None, view, every, self._scene)
         rect = mujoco.MjrRect(0, 0, width_px, height_px)
         pixels = np.empty((height_px, width_px, 3), np.uint8)

@@ -5,8 +5,10 @@ there is no one sea. So around each vessel its own waves are drawn, faded into e
 them. `--coupled` has one wave field, drawn as it is. A recording has no known waves: calm water.
 """
 
+import functools
 import math
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -28,6 +30,7 @@ REACH_M = 16.0
 """Elevation is tabulated this far along the waves from vessel A's midship, laboratory metres."""
 SPACING_M = 0.06
 """The shortest waves, 3.2 rad/s at full scale, are 0.6 m long in the laboratory."""
+POINTS = 2 * round(REACH_M / SPACING_M) + 1
 FAN = 0.8
 """The strip in which two wave fields fade widens by this, both ways, per metre off the vessels."""
 
@@ -69,29 +72,28 @@ class Surface:
         return np.interp(along_m, np.linspace(-REACH_M, REACH_M, len(profile_m)), profile_m)
 
 
-def surface(take: Take, motion: MotionConfig, time_s: np.ndarray) -> Surface:
-    """The sea of an episode's test motion at the instants to draw.
+def surface(
+    take: Take, motion: MotionConfig, time_s: np.ndarray, role: Literal["train", "test"] = "test"
+) -> Surface:
+    """The sea of an episode's motion at the instants to draw.
 
     Args:
         time_s: (frames,) since the episode's beginning.
+        role: whose motion it is.
     """
     knobs = VesselKnobs()
-    points = 2 * round(REACH_M / SPACING_M) + 1
     if motion.motion:
         note = "A recording holds no waves: the water is drawn calm."
-        profiles_m = np.zeros((1, len(time_s), points))
+        profiles_m = np.zeros((1, len(time_s), POINTS))
     else:
         sea = parse_sea(take.sea)
         coupled = motion.is_coupled(take.sea)
-        role = "train" if motion.split == "paper" else "test"
-        seed = table_seed(sea, role, int(take.poses[0].seed[0]))
-        cut = paper_rows("test").start * KNOT_DT_S if motion.split == "paper" else 0.0
+        one_hour = motion.split == "paper"
+        seed = table_seed(sea, "train" if one_hour else role, int(take.poses[0].seed[0]))
+        cut = (paper_rows(role).start or 0) * KNOT_DT_S if one_hour else 0.0
         starts_s = take.window_starts_s[:1] if coupled else take.window_starts_s
         (amplitudes,) = wave_amplitudes(sea, seed, knobs)  # one direction: long-crested
-        along_m = np.linspace(-REACH_M, REACH_M, points)
-        profiles_m = np.stack(
-            [_profile(amplitudes, cut + start + time_s, along_m) for start in starts_s]
-        )
+        profiles_m = np.stack([_profile(amplitudes, cut + start + time_s) for start in starts_s])
         note = (
             "Both vessels in the one wave field that is drawn."
             if coupled
@@ -106,13 +108,19 @@ def surface(take: Take, motion: MotionConfig, time_s: np.ndarray) -> Surface:
     )
 
 
-def _profile(amplitudes: np.ndarray, time_s: np.ndarray, along_m: np.ndarray) -> np.ndarray:
-    """Re sum a_k e^{i (k s - w t)}: (frames, points) laboratory metres, from full-scale waves."""
+def _profile(amplitudes: np.ndarray, time_s: np.ndarray) -> np.ndarray:
+    """Re sum a_k e^{i (k s - w t)}: (frames, POINTS) laboratory metres, from full-scale waves."""
     omega = component_grid()[1]
-    wavenumber = omega**2 / GRAVITY_M_S2
     full_s = math.sqrt(FROUDE_LAMBDA) * time_s
     in_time = amplitudes * np.exp(-1j * np.outer(full_s, omega))
-    in_space = np.exp(1j * np.outer(wavenumber, FROUDE_LAMBDA * along_m))
     # The phases are exact by now; single precision is 1e-6 of a wave and twice as fast.
-    total = in_time.astype(np.complex64) @ in_space.astype(np.complex64)
+    total = in_time.astype(np.complex64) @ _in_space()
     return total.real / FROUDE_LAMBDA
+
+
+@functools.cache
+def _in_space() -> np.ndarray:
+    """e^{i k s}: (n, POINTS) complex64. Kept: it takes a second, the rest of a frame 10 ms."""
+    wavenumber = component_grid()[1] ** 2 / GRAVITY_M_S2
+    along_m = np.linspace(-REACH_M, REACH_M, POINTS)
+    return np.exp(1j * np.outer(wavenumber, FROUDE_LAMBDA * along_m)).astype(np.complex64)
