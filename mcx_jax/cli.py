@@ -36,8 +36,10 @@ def parse(
         default: defaults other than the class's own.
 
     Raises:
-        UserError: unknown flag, missing value, value of the wrong kind or out of range.
+        UserError: unknown flag, missing value, value of the wrong kind or out of range, a flag
+            given twice.
     """
+    _refuse_repeats(argv)
     kwargs: dict[str, Any] = {} if default is None else {"default": default}
     said = io.StringIO()
     try:
@@ -53,6 +55,18 @@ def parse(
         if stop.code in (0, None):  # --help
             raise
         raise UserError(_one_line(said.getvalue())) from None
+
+
+def _refuse_repeats(argv: Sequence[str]) -> None:
+    """tyro takes the last of two values in silence; which of them is meant only the user knows."""
+    given: set[str] = set()
+    for word in argv:
+        if not word.startswith("--"):
+            continue
+        flag = word.split("=", 1)[0].replace("_", "-").replace("--no-", "--", 1)
+        if flag in given:
+            raise UserError(f"{flag} is given twice; leave one of them out")
+        given.add(flag)
 
 
 def _one_line(box: str) -> str:
@@ -97,7 +111,8 @@ def _box_text(box: str) -> str:
 
 
 def value_of(argv: Sequence[str], flag: str) -> str | None:
-    """Value of a flag that other defaults hang on, read before the real parsing; the last wins."""
+    """Value of a flag that other defaults hang on, read before the real parsing, which refuses a
+    flag that is given twice; the last of them."""
     value = None
     for i, word in enumerate(argv):
         if word.startswith(f"{flag}="):
