@@ -152,11 +152,14 @@ def _tell_windows(path: str, motion: Motion, episode_steps: int) -> None:
 
 def _generated(config: MotionConfig, split: Literal["train", "test"]):
     from mcx_jax.sea.spectrum import parse_sea
-    from mcx_jax.sea.tables import build_tables
+    from mcx_jax.sea.tables import build_tables, doubts
 
     names = NAMED_SEAS if config.sea == "all" else tuple(config.sea.split(","))
     seas = [parse_sea(name) for name in names]
     coupled = tuple(config.is_coupled(name) for name in names)
+    for sea, together in zip(seas, coupled, strict=True):
+        for line in doubts(sea, together):
+            notice(line)
     tables = build_tables(seas, split, coupled=coupled, split=config.split)
     return tables.sea_names, tables.knots, tables.companion, coupled
 
