@@ -6,6 +6,7 @@ file. The same seed gives the same motion and the same goals to everyone.
 
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
@@ -15,8 +16,8 @@ from mcx_jax.config import check_seed
 from mcx_jax.delay import parse_delay
 from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.errors import UserError
-from mcx_jax.paper import is_papers_world
 from mcx_jax.roster import fit_if_needed, informed, load_controller
+from mcx_jax.terminal import silent, working
 
 
 @dataclass(frozen=True)
@@ -83,22 +84,36 @@ def evaluation_env(env_config: EnvConfig, motion_config: MotionConfig):
         UserError: episodes that end within the warm-up.
     """
     from mcx_jax.envs.v2v import make_env
-    from mcx_jax.results import WARM_UP_STEPS
+    from mcx_jax.results import LEAST_STEPS, WARM_UP_STEPS
 
-    if env_config.episode_steps <= WARM_UP_STEPS:
+    if env_config.episode_steps < LEAST_STEPS:
         raise UserError(
             f"--episode-steps {env_config.episode_steps}: the first {WARM_UP_STEPS} steps are not "
-            f"counted; evaluate at least {WARM_UP_STEPS + 1}"
+            f"counted; evaluate at least {LEAST_STEPS}"
         )
     return make_env(env_config, motion_config, split="test")
 
 
-def errors_beside_ik(who: str, controller: Any, env, *, episodes: int, seed: int) -> list[Errors]:
-    """Errors of the IK baseline and of a controller on the same episodes; `ik` runs alone."""
+def errors_beside_ik(
+    who: str,
+    controller: Any,
+    env,
+    *,
+    episodes: int,
+    seed: int,
+    say: Callable[[str], None] = silent,
+) -> list[Errors]:
+    """Errors of the IK baseline and of a controller on the same episodes; `ik` runs alone.
+
+    Args:
+        say: what happens is said to it (`mcx_jax.terminal.working`).
+    """
     from mcx_jax.episodes import episode_errors
 
     names = ("ik",) if who == "ik" else ("ik", who)
     gains = (0.0, 1.0)[: len(names)]
+    count = len(names) * len(env.motion.seas) * episodes
+    say(f"compiling (up to 2 min the first time) and running {count} episodes")
     dp, da, valid, correction, share = episode_errors(env, controller, gains, episodes, seed)
     return [
         Errors(
@@ -123,6 +138,7 @@ def evaluate_beside_ik(
     *,
     episodes: int = 50,
     seed: int = 0,
+    say: Callable[[str], None] = silent,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Evaluate the IK baseline and a controller on the test motion of every sea asked for.
 
@@ -131,6 +147,7 @@ def evaluate_beside_ik(
         controller: see mcx_jax.controllers.
         episodes: per sea.
         seed: of the windows of motion and the goals; the same for every controller.
+        say: what happens is said to it (`mcx_jax.terminal.working`).
 
     Returns:
         (rows of ik, rows of who), one a sea, as described in the README (section Commands).
@@ -139,7 +156,9 @@ def evaluate_beside_ik(
         UserError: episodes that end within the warm-up.
     """
     env = evaluation_env(env_config, motion_config)
-    return rows_beside_ik(errors_beside_ik(who, controller, env, episodes=episodes, seed=seed))
+    return rows_beside_ik(
+        errors_beside_ik(who, controller, env, episodes=episodes, seed=seed, say=say)
+    )
 
 
 def rows_beside_ik(
@@ -169,66 +188,10 @@ def evaluate(
     )[1]
 
 
-def print_table(rows: list[dict[str, Any]], file=None, *, papers_world: bool) -> None:
-    """Print result rows as a table.
-
-    Args:
-        papers_world: put table 3's means beside them, where it has such a delay and sea
-            (`mcx_jax.paper.is_papers_world`).
-    """
-    from rich.console import Console
-    from rich.table import Table
-
-    from mcx_jax.results import paper_errors
-
-    published = [paper_errors(r["who"], r["delay"], r["sea"]) for r in rows]
-    beside = papers_world and any(published)
-    paper = ("paper",) if beside else ()
-    table = Table(title=f"tracking error, delay {rows[0]['delay']}")
-    for name in ("who", "sea", "dp mm", "std", "top 5%", "top 1%", "max", "vs ik", *paper):
-        table.add_column(name, justify="left" if name in ("who", "sea") else "right")
-    for name in ("da mrad", "std", "max", "vs ik", *paper, "invalid"):
-        table.add_column(name, justify="right")
-    for r, means in zip(rows, published, strict=True):
-        p, a = r["pos_mm"], r["ang_mrad"]
-        papers = [(f"{x:.2f}",) for x in means] if means else [("-",), ("-",)]
-        pos_paper, ang_paper = papers if beside else ((), ())
-        table.add_row(
-            *(r["who"], r["sea"], f"{p['mean']:.3f}", f"{p['std']:.2f}"),
-            *(f"{p['top5']:.2f}", f"{p['top1']:.2f}", f"{p['max']:.2f}"),
-            f"{100 * r['improvement']['pos']['all']:.0f} %",
-            *pos_paper,
-            *(f"{a['mean']:.3f}", f"{a['std']:.2f}", f"{a['max']:.2f}"),
-            f"{100 * r['improvement']['ang']['all']:.0f} %",
-            *ang_paper,
-            f"{r['invalid_episodes']}/{r['episodes']}",
-        )
-    console = Console(file=file, width=None if (file or sys.stdout).isatty() else 150)
-    console.print(table)
-    for who in dict.fromkeys(r["who"] for r in rows):
-        console.print(_effort_line(who, [r for r in rows if r["who"] == who]), highlight=False)
-
-
-def _effort_line(who: str, rows: list[dict[str, Any]]) -> str:
-    """The largest correction and the use of the torque limits over all seas."""
-    corrections = [r["correction"] for r in rows]
-    most = {name: max(c[name] for c in corrections) for name in corrections[0]}
-    share = max(r["torque_share"]["mean"] for r in rows)
-    limited = max(r["torque_share"]["at_limit"] for r in rows)
-    far_mm, far_mrad, rate_mm_s, rate_mrad_s = (
-        10 * most[name] for name in ("max_cm", "max_crad", "rate_cm_s", "rate_crad_s")
-    )
-    return (
-        f"{who}, worst sea: correction up to {far_mm:.1f} mm {far_mrad:.1f} mrad, "
-        f"mean rate {rate_mm_s:.0f} mm/s {rate_mrad_s:.0f} mrad/s; most loaded "
-        f"joint at {100 * share:.0f} % of its torque limit on average, {100 * limited:.1f} % of "
-        "the steps at the limit"
-    )
-
-
 def main(argv: list[str] | None = None) -> None:
     """Command line."""
     from mcx_jax import cli, startup
+    from mcx_jax.result_table import print_table
 
     argv = list(sys.argv[1:] if argv is None else argv)
     config = cli.parse(EvaluateConfig, cli.optional_value(argv, "--json", "-"), prog="evaluate")
@@ -239,16 +202,20 @@ def main(argv: list[str] | None = None) -> None:
         print(line, file=report)
     print(config.env.describe_delays(), file=report)
     who, controller = load_controller(config.who)
-    env = informed(evaluation_env(config.env, config.motion), config.known_delay)
-    controller = fit_if_needed(who, controller, config.env, config.motion, config.known_delay)
-    errors = errors_beside_ik(who, controller, env, episodes=config.episodes, seed=config.seed)
+    with working("preparing the vessels' motion", report) as say:
+        env = informed(evaluation_env(config.env, config.motion), config.known_delay)
+        task = config.env, config.motion, config.known_delay
+        controller = fit_if_needed(who, controller, *task, say)
+        errors = errors_beside_ik(
+            who, controller, env, episodes=config.episodes, seed=config.seed, say=say
+        )
     baseline, rows = rows_beside_ik(errors)
-    ideal = is_papers_world(config.env, config.motion)
-    print_table(rows if who == "ik" else baseline + rows, report, papers_world=ideal)
+    print_table(rows if who == "ik" else baseline + rows, config.env, config.motion, report)
+    text = json.dumps(rows, indent=1, allow_nan=False)
     if quiet:
-        print(json.dumps(rows, indent=1))
+        print(text)
     elif config.json:
-        cli.write_output("--json", config.json, json.dumps(rows, indent=1) + "\n")
+        cli.write_output("--json", config.json, text + "\n")
 
 
 if __name__ == "__main__":

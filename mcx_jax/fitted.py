@@ -6,6 +6,7 @@ policy sees of the goal, are told the delay and the age of measurements, and are
 conditions they are evaluated under: they know more than a policy that was trained for many.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -30,6 +31,7 @@ from mcx_jax.spatial import (
     unpack,
     unpack_matrix,
 )
+from mcx_jax.terminal import silent
 
 TAPS = 25
 """Poses that the filter sees, half a second of them."""
@@ -129,22 +131,24 @@ def _regression(
     return jax.lax.map(episode, keys)
 
 
-def fitted(who: str, env: V2VEnv) -> Any:
+def fitted(who: str, env: V2VEnv, say: Callable[[str], None] = silent) -> Any:
     """The controller `extrapolate-best` or `fir`, with the lead that tracks best.
 
     Args:
         env: on training motion.
+        say: what happens is said to it (`mcx_jax.terminal.working`).
 
     Raises:
         UserError: none of them keeps the arm's state finite.
     """
     known_s = env.known_delay.group_delay_s
-    leads_s = [known_s + lead for lead in LEADS_S]
-    if who == "extrapolate-best":
-        candidates: list[Any] = [Extrapolate(jnp.float32(lead)) for lead in leads_s]
-    else:
-        candidates = [fit_fir(env, lead) for lead in leads_s]
-    scores = np.array([_score(env, candidate) for candidate in candidates])
+    candidates, scores = [], []
+    for i, lead in enumerate(LEADS_S):
+        say(f"fitting {who}: lead {i + 1} of {len(LEADS_S)} (compiles with the first)")
+        best = who == "extrapolate-best"
+        lead_s = known_s + lead
+        candidates.append(Extrapolate(jnp.float32(lead_s)) if best else fit_fir(env, lead_s))
+        scores.append(_score(env, candidates[-1]))
     if not np.isfinite(scores).any():
         raise UserError(f"{who}: the arm diverges on training motion, whatever the lead")
     return candidates[int(np.argmin(np.nan_to_num(scores, nan=np.inf)))]

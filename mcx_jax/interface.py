@@ -23,6 +23,7 @@ ACTION_TABLE = (
     ObservationRow("turn_G", 3, "crad", "rotation vector (axis times angle) of G, in its own axes"),
 )
 """Order of the action."""
+ACTION_SIZE = sum(row.size for row in ACTION_TABLE)
 ACTION_USE = (
     "the arm aims its tool at (R_B_G exp(0.01 turn_G), p_B_G + R_B_G 0.01 shift_G) in B, by "
     "inverse kinematics, in place of the goal; an action of zero is no correction"
@@ -38,7 +39,7 @@ def describe(net: PolicyNet, obs_size: int, config: str) -> dict[str, Any]:
     """
     known = {OBS_SIZE: OBS_TABLE, OBS_SIZE + 1: (*OBS_TABLE, AGE)}
     observation = known.get(obs_size, _unnamed("observation", obs_size))
-    action = ACTION_TABLE if net.actions == 6 else _unnamed("action", net.actions)
+    action = ACTION_TABLE if net.actions == ACTION_SIZE else _unnamed("action", net.actions)
     return {
         "frames": FRAMES,
         "rate_hz": round(1.0 / CONTROL_DT_S),

@@ -20,6 +20,7 @@ from flax import struct, traverse_util
 
 from mcx_jax import interface
 from mcx_jax.assets import policy_file
+from mcx_jax.envs.observe import OBS_SIZE
 from mcx_jax.errors import UserError
 from mcx_jax.ppo.networks import CELLS, Carry, Params, PolicyNet, init_params, step
 from mcx_jax.ppo.networks import init_carry as zero_carry
@@ -30,6 +31,9 @@ FORMAT = 1
 KIND = "mcx_jax policy"
 MAX_SIZE = 2**16
 """Of an observation, an action and a layer; a file that says more is damaged."""
+LARGEST = 1e30
+"""Of any number in a file: with `MAX_SIZE` of them and inputs of at most 10, no float32 sum in the
+network overflows, so that whatever is loaded acts with finite numbers."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,17 +167,14 @@ def load_policy(path: str | Path) -> Policy:
     """Read a policy file.
 
     Raises:
-        UserError: missing, not a policy file, cut short, of another format, or with wrong shapes.
+        UserError: missing, not a policy file, cut short, of another format, with wrong shapes, or
+            with numbers that no training gives.
     """
     path = Path(path)
     arrays = _read(path)
     meta = _meta(path, arrays.pop("metadata", None))
     expected = _named(_empty(meta))
-    for name, like in expected.items():
-        if name not in arrays or arrays[name].shape != like.shape:
-            raise UserError(f"{path}: not a whole policy file: {name} is missing or misshapen")
-        if arrays[name].dtype.kind != "f" or not np.isfinite(arrays[name]).all():
-            raise UserError(f"{path}: not a policy that can act: {name} has no finite numbers")
+    arrays = {name: _array(path, name, arrays, like.shape) for name, like in expected.items()}
     weights = {tuple(n.split("/")[1:]): jnp.asarray(arrays[n]) for n in expected if "obs/" not in n}
     stats = {field: jnp.asarray(arrays[f"obs/{field}"]) for field in ("count", "mean", "var")}
     return Policy(
@@ -181,6 +182,38 @@ def load_policy(path: str | Path) -> Policy:
         obs_stats=RunningStats(**stats),
         meta=meta,
     )
+
+
+def _array(
+    path: Path, name: str, arrays: dict[str, np.ndarray], shape: tuple[int, ...]
+) -> np.ndarray:
+    """An array of the file as float32 of this machine's byte order, whatever wrote it."""
+    if name not in arrays or arrays[name].shape != shape:
+        raise UserError(f"{path}: not a whole policy file: {name} is missing or misshapen")
+    x = arrays[name]
+    # A NaN fails every comparison.
+    if x.dtype.kind != "f" or not (np.abs(x) <= LARGEST).all():
+        raise UserError(
+            f"{path}: not a policy that can act: {name} has no finite numbers, or some beyond "
+            f"{LARGEST:g}"
+        )
+    if name in ("obs/count", "obs/var") and (x < 0).any():
+        raise UserError(f"{path}: not a policy that can act: {name} is negative")
+    return x.astype(np.float32)
+
+
+def require_task(path: str | Path, meta: PolicyMeta) -> None:
+    """Refuse a policy that is not for this task, of 38 or 39 observed and 6 corrected numbers.
+
+    Raises:
+        UserError: it is not.
+    """
+    taken, given = (OBS_SIZE, OBS_SIZE + 1), interface.ACTION_SIZE
+    if meta.obs_size not in taken or meta.action_size != given:
+        raise UserError(
+            f"{path}: reads {meta.obs_size} numbers and gives {meta.action_size}; a policy for "
+            f"this task reads {taken[0]} or {taken[1]} and gives {given}"
+        )
 
 
 def named_arrays(policy: Policy) -> dict[str, np.ndarray]:
@@ -232,10 +265,12 @@ def _meta(path: Path, text: np.ndarray | None) -> PolicyMeta:
     except (TypeError, ValueError, RecursionError):
         raise foreign from None
     sizes = meta.obs_size, meta.action_size, meta.hidden
+    counts = meta.iteration, meta.seed
     if (
         not known
         or meta.cell not in tuple(CELLS)
         or not all(type(n) is int and 0 < n <= MAX_SIZE for n in sizes)
+        or not all(type(n) is int and n >= 0 for n in counts)
     ):
         raise foreign
     return meta

@@ -1,6 +1,5 @@
 """What a training run prints: one line of progress, drawn in place on a terminal."""
 
-import shutil
 import sys
 import time
 from dataclasses import dataclass, field
@@ -9,6 +8,7 @@ from typing import Any, TextIO
 from mcx_jax.config import TrainConfig
 from mcx_jax.paper import is_papers_world
 from mcx_jax.results import paper_means
+from mcx_jax.terminal import columns, paragraph
 
 PLAIN_INTERVAL_S = 10.0
 """Seconds between lines where the output is no terminal."""
@@ -25,17 +25,31 @@ def short_time(seconds: float) -> str:
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
 
 
-def references(config: TrainConfig) -> tuple[str, str]:
-    """What to print beside dp and da: table 3's IK baseline and agents, for the seas of the run.
+TRAINING_NOTE = (
+    "dp, da: errors of training episodes, with exploration and an episode's first second; the "
+    "table at the end has neither, and first iterations may look worse than no correction"
+)
 
-    ("", "") where table 3 has none: another delay or sea, or not the paper's world.
+
+def references(config: TrainConfig) -> str:
+    """What the paper reached in the seas of the run, a line; "" where table 3 has nothing.
+
+    That is: another delay or sea, or not the paper's world.
     """
     env, motion = config.env, config.motion
     ik, paper = (paper_means(who, env.delay, motion.sea) for who in ("ik", "paper"))
     if ik is None or paper is None or not is_papers_world(env, motion):
-        return "", ""
-    position, angle = (f" (IK {a:.2f}, paper {b:.2f})" for a, b in zip(ik, paper, strict=True))
-    return position, angle
+        return ""
+    return (
+        f"for comparison, table 3 of the paper, on test motion: its trained agents {paper[0]:.2f} "
+        f"mm {paper[1]:.2f} mrad, the baseline that they imply {ik[0]:.2f} mm {ik[1]:.2f} mrad"
+    )
+
+
+def _span(values: list[float]) -> str:
+    """A value; of several seeds the least and the largest."""
+    ends = dict.fromkeys(f"{x:.2f}" for x in (min(values), max(values)))
+    return " to ".join(ends)
 
 
 LEFT_OUT = {"ppo": "windows", "first-order": "steps"}
@@ -53,6 +67,17 @@ class Progress:
     printed: float = -1e9
     warned: bool = False
 
+    def begin(self) -> None:
+        """Say what the lines that follow show, before the first iteration, if there is one."""
+        if self.start_iteration == self.config.iterations:
+            return
+        for text in (TRAINING_NOTE, references(self.config)):
+            if text:
+                paragraph(text, self.out)
+        if self.out.isatty():
+            self.out.write(f"{self.start_iteration}/{self.config.iterations} | first iteration")
+            self.out.flush()
+
     def show(self, rows: list[dict[str, Any]]) -> None:
         """Report an iteration: its rows, one per seed."""
         iteration = rows[0]["iteration"]
@@ -60,32 +85,39 @@ class Progress:
         self._warn(rows)
         if self.out.isatty():
             end = "\n" if done else ""
-            width = shutil.get_terminal_size().columns - 1
-            self.out.write(f"\r\x1b[K{self.line(rows)[:width]}{end}")
+            self.out.write(f"\r\x1b[K{self.line(rows, columns(self.out) - 1)}{end}")
         elif done or time.monotonic() - self.printed > PLAIN_INTERVAL_S:
             self.out.write(self.line(rows) + "\n")
             self.printed = time.monotonic()
         self.out.flush()
 
-    def line(self, rows: list[dict[str, Any]]) -> str:
-        """One line: how good, how far, how fast; the end is cut off on a narrow terminal.
+    def line(self, rows: list[dict[str, Any]], width: int | None = None) -> str:
+        """One line: how far, how good, how fast.
 
-        The errors include the exploration noise and an episode's first second, which the IK
-        baseline and the paper's agents beside them do not.
+        Args:
+            rows: of an iteration, one per seed.
+            width: parts at the end that do not fit are left out; None = none.
         """
+        parts = self._parts(rows)
+        while width is not None and len(" | ".join(parts)) > width and len(parts) > 1:
+            parts.pop()
+        return " | ".join(parts)
+
+    def _parts(self, rows: list[dict[str, Any]]) -> list[str]:
+        """The most important first."""
         iteration, total = rows[0]["iteration"], self.config.iterations
         elapsed = max(time.monotonic() - self.begun, 1e-9)
         done = iteration - self.start_iteration
         rate = done * self.config.steps_per_iteration * self.config.seeds / elapsed
         left = (total - iteration) * elapsed / max(done, 1)
-        position = " ".join(f"{row['pos_error_mm']:.2f}" for row in rows)
-        angle = " ".join(f"{row['ang_error_mrad']:.2f}" for row in rows)
-        beside = references(self.config)
-        noise = f" | sigma {rows[0]['sigma']:.3f}" if "sigma" in rows[0] else ""
-        return (
-            f"{iteration}/{total} | dp {position} mm{beside[0]} | da {angle} mrad{beside[1]} | "
-            f"ETA {short_time(left)} | {rows[0]['steps'] / 1e6:.2f} M steps, {rate:,.0f}/s{noise}"
-        )
+        position = _span([row["pos_error_mm"] for row in rows])
+        angle = _span([row["ang_error_mrad"] for row in rows])
+        noise = [f"sigma {rows[0]['sigma']:.3f}"] if "sigma" in rows[0] else []
+        return [
+            *(f"{iteration}/{total}", f"ETA {short_time(left)}"),
+            *(f"training dp {position} mm", f"da {angle} mrad"),
+            *(f"{rows[0]['steps'] / 1e6:.2f} M steps", f"{rate:,.0f}/s", *noise),
+        ]
 
     def _warn(self, rows: list[dict[str, Any]]) -> None:
         share = max(row["rejected_share"] for row in rows)
@@ -96,7 +128,8 @@ class Progress:
                 "ppo": f"failed IK or a mean squared reward above --reject-mean-sq-reward {limit}",
                 "first-order": "failed IK, or the tool or a joint's speed out of all bounds",
             }
+            over = "\r\x1b[K" if self.out.isatty() else ""
             self.out.write(
-                f"warning: {100 * share:.0f} % of the {LEFT_OUT[self.config.algo]} are left out of "
-                f"learning: {why[self.config.algo]}\n"
+                f"{over}warning: {100 * share:.0f} % of the {LEFT_OUT[self.config.algo]} are left "
+                f"out of learning: {why[self.config.algo]}\n"
             )

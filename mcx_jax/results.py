@@ -11,6 +11,8 @@ from mcx_jax.paper import table3
 
 WARM_UP_STEPS = 50
 """The first second of every episode is dropped (paper)."""
+LEAST_STEPS = WARM_UP_STEPS + 2
+"""Of an episode that is evaluated: a rate needs two of them."""
 GROUPS = ("all", "top5", "top1", "max")
 """Improvements: of the mean over all points, the worst 5 %, the worst 1 %, and of the maximum."""
 
@@ -80,19 +82,23 @@ def row(
         valid: (episodes,) bool.
 
     Raises:
-        UserError: no episode has finite errors.
+        UserError: no episode has finite errors, or their statistics are beyond all numbers.
     """
     finite = finite_episodes(pos_m, ang_rad)
     if not finite.any():
         raise UserError(f"{who}, {delay}, {sea}: every episode diverged: nothing to report")
+    with np.errstate(over="ignore", invalid="ignore"):  # refused below
+        mm, mrad = (error_statistics(1e3 * x[WARM_UP_STEPS:, finite]) for x in (pos_m, ang_rad))
+    if not np.isfinite([*mm.values(), *mrad.values()]).all():
+        raise UserError(f"{who}, {delay}, {sea}: errors beyond all numbers: nothing to report")
     return {
         "who": who,
         "delay": delay,
         "sea": sea,
         "episodes": int(valid.size),
         "invalid_episodes": int((~valid).sum()),
-        "pos_mm": error_statistics(1e3 * pos_m[WARM_UP_STEPS:, finite]),
-        "ang_mrad": error_statistics(1e3 * ang_rad[WARM_UP_STEPS:, finite]),
+        "pos_mm": mm,
+        "ang_mrad": mrad,
     }
 
 
@@ -102,16 +108,23 @@ def effort(correction: np.ndarray, torque_share: np.ndarray) -> dict[str, Any]:
     Args:
         correction: (steps, 6, episodes), cm and crad.
         torque_share: (steps, episodes) of the joint nearest its torque limit, 1 = at it.
+
+    Raises:
+        UserError: there is no such point.
     """
     shift, turn = correction[WARM_UP_STEPS:, :3], correction[WARM_UP_STEPS:, 3:]
     share = torque_share[WARM_UP_STEPS:]
-    rate = lambda x: float(np.nanmean(np.linalg.norm(np.diff(x, axis=0), axis=1)) / CONTROL_DT_S)  # noqa: E731
+    changes = [np.linalg.norm(np.diff(x, axis=0), axis=1) for x in (shift, turn)]
+    # A clipped number is finite or NaN.
+    for name, x in (("correction", changes[0]), ("correction", changes[1]), ("torque", share)):
+        if np.isnan(x).all():
+            raise UserError(f"no {name} in any episode is a finite number: nothing to report")
     return {
         "correction": {
             "max_cm": float(np.nanmax(np.abs(shift))),
             "max_crad": float(np.nanmax(np.abs(turn))),
-            "rate_cm_s": rate(shift),
-            "rate_crad_s": rate(turn),
+            "rate_cm_s": float(np.nanmean(changes[0]) / CONTROL_DT_S),
+            "rate_crad_s": float(np.nanmean(changes[1]) / CONTROL_DT_S),
         },
         "torque_share": {
             "mean": float(np.nanmean(share)),

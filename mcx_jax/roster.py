@@ -1,6 +1,7 @@
 """Controllers by the name that the commands use. Needs no JAX until one is loaded."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ from mcx_jax.assets import policy_file
 from mcx_jax.delay import parse_delay
 from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.errors import UserError
+from mcx_jax.terminal import silent
 
 WHO = ("ik", "extrapolate", "extrapolate-best", "fir", "preview")
 FITTED = ("extrapolate-best", "fir")
@@ -32,7 +34,11 @@ def policy_path(who: str) -> Path | None:
 
 def load_controller(who: str) -> tuple[str, Any]:
     """(name, controller) for a name, a run directory or a policy file; the controller is None for
-    one of FITTED, which needs a task first (`fit_if_needed`)."""
+    one of FITTED, which needs a task first (`fit_if_needed`).
+
+    Raises:
+        UserError: no such controller, a file that is no policy, or one for another task.
+    """
     path = policy_path(who)
     if who in FITTED:
         return who, None
@@ -40,21 +46,33 @@ def load_controller(who: str) -> tuple[str, Any]:
         from mcx_jax.controllers import CLASSICAL
 
         return who, CLASSICAL[who]
-    from mcx_jax.policy import PolicyController, load_policy
+    from mcx_jax.policy import PolicyController, load_policy, require_task
 
-    return who.rstrip("/"), PolicyController(load_policy(path))
+    policy = load_policy(path)
+    require_task(path, policy.meta)
+    return who.rstrip("/"), PolicyController(policy)
 
 
 def fit_if_needed(
-    who: str, controller: Any, env_config: EnvConfig, motion_config: MotionConfig, known_delay: str
+    who: str,
+    controller: Any,
+    env_config: EnvConfig,
+    motion_config: MotionConfig,
+    known_delay: str,
+    say: Callable[[str], None] = silent,
 ) -> Any:
-    """The controller of `load_controller`, fitted on training motion if it is one of FITTED."""
+    """The controller of `load_controller`, fitted on training motion if it is one of FITTED.
+
+    Args:
+        say: what happens is said to it (`mcx_jax.terminal.working`).
+    """
     if controller is not None:
         return controller
     from mcx_jax.envs.v2v import make_env
     from mcx_jax.fitted import fitted
 
-    return fitted(who, informed(make_env(env_config, motion_config, split="train"), known_delay))
+    env = informed(make_env(env_config, motion_config, split="train"), known_delay)
+    return fitted(who, env, say)
 
 
 def informed(env, known_delay: str):

@@ -149,16 +149,20 @@ def final_table(config: TrainConfig, policy: "Policy", episodes: int, steps: int
         episodes: per sea.
         steps: control steps of an episode, whatever the length in training.
     """
-    from mcx_jax.evaluate import evaluate_beside_ik, print_table
-    from mcx_jax.paper import is_papers_world
+    from mcx_jax.evaluate import evaluate_beside_ik
     from mcx_jax.policy import PolicyController
+    from mcx_jax.result_table import print_table
+    from mcx_jax.terminal import working
 
     named = config.motion.sea in ("all", "Wa", "Wb", "Wc", "Wd")
     motion = replace(config.motion, sea="all") if named else config.motion
     env = replace(config.env, episode_steps=steps)
     controller = PolicyController(policy)
-    baseline, rows = evaluate_beside_ik("policy", controller, env, motion, episodes=episodes)
-    print_table(baseline + rows, papers_world=is_papers_world(env, motion))
+    with working("evaluating on test motion") as say:
+        baseline, rows = evaluate_beside_ik(
+            "policy", controller, env, motion, episodes=episodes, say=say
+        )
+    print_table(baseline + rows, env, motion)
 
 
 QUICK_COMPILE = "--xla_backend_optimization_level=0"

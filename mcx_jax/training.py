@@ -16,6 +16,7 @@ from mcx_jax.errors import UserError
 from mcx_jax.progress import Progress, short_time
 from mcx_jax.run_dir import POLICY, RunDir, writing
 from mcx_jax.stop import StopRequest
+from mcx_jax.terminal import working
 
 if TYPE_CHECKING:
     from mcx_jax.policy import Policy
@@ -112,6 +113,7 @@ def iterate(
     from mcx_jax.divergence import Watch
 
     config, progress = run.config, Progress(run.config, run.start_iteration)
+    progress.begin()
     watch = Watch(run)
     saved = time.monotonic()
     rows = run.last_rows()
@@ -197,7 +199,9 @@ def _train(
     env = make_env(config.env, config.motion, split="train")
     first = None if run.start_iteration else first_policy(config, env)
     ready = time.monotonic()
-    training = prepare(config, env)
+    with working("compiling") as say:
+        say("compiling (1 to 2 min the first time)")
+        training = prepare(config, env)
     print(
         f"set-up {short_time(ready - begun)}, compile {short_time(time.monotonic() - ready)}; "
         f"{config.iterations} iterations of {config.num_envs} x {config.iteration_steps} steps",

@@ -9,16 +9,19 @@ import pytest
 
 from mcx_jax.errors import UserError
 from mcx_jax.policy import (
+    LARGEST,
     Policy,
     PolicyController,
     PolicyMeta,
     act,
     init_carry,
     load_policy,
+    require_task,
     save_policy,
 )
 from mcx_jax.ppo.networks import init_params
 from mcx_jax.ppo.normalise import RunningStats
+from mcx_jax.roster import load_controller
 
 
 @pytest.fixture(scope="module")
@@ -135,3 +138,75 @@ def test_of_an_unknown_cell(saved, cell):
 def test_without_a_weight(saved, value):
     _rewrite(saved, **{"policy/raw_sigma": value})
     _refused(saved, "{path}: not a whole policy file: policy/raw_sigma is missing or misshapen")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("obs/var", np.array([1.0, 1.0, -1e-9, 1.0, 1.0]), "obs/var is negative"),
+        ("obs/count", np.array(-1.0), "obs/count is negative"),
+        *(
+            ("obs/mean", np.array([0, 0, bad, 0, 0], np.float64), "obs/mean has no finite numbers")
+            for bad in (np.nan, np.inf, 1e31, 1e300)
+        ),
+        ("policy/raw_sigma", np.zeros(3, int), "policy/raw_sigma has no finite numbers"),
+        ("policy/raw_sigma", np.zeros(3, complex), "policy/raw_sigma has no finite numbers"),
+    ],
+)
+def test_numbers_that_no_training_gives(saved, name, value, said):
+    _rewrite(saved, **{name: value})
+    with pytest.raises(UserError) as error:
+        load_policy(saved)
+    assert str(error.value).startswith(f"{saved}: not a policy that can act: {said}")
+
+
+@pytest.mark.parametrize("dtype", [">f4", ">f8", "<f8", "longdouble"])
+def test_every_kind_of_float_is_read_the_same(policy, saved, dtype):
+    """Files of another machine: big-endian arrays ended in a TypeError."""
+    with np.load(saved) as file:
+        arrays = {name: file[name] for name in file.files}
+    _rewrite(saved, **{k: v.astype(dtype) for k, v in arrays.items() if v.dtype.kind == "f"})
+    loaded = load_policy(saved)
+    jax.tree.map(np.testing.assert_array_equal, loaded.params, policy.params)
+    jax.tree.map(np.testing.assert_array_equal, loaded.obs_stats, policy.obs_stats)
+
+
+@pytest.mark.parametrize("cell", ["lstm", "gru"])
+def test_the_largest_numbers_that_are_read_still_act(cell, tmp_path):
+    meta = PolicyMeta(obs_size=5, action_size=3, hidden=8, cell=cell)
+    params = init_params(meta.net, jax.random.key(0), 5)
+    rng = np.random.default_rng(0)
+    huge = lambda x: LARGEST * rng.choice([-1.0, 1.0], x.shape).astype(np.float32)  # noqa: E731
+    stats = RunningStats(jnp.float32(LARGEST), jnp.full(5, LARGEST), jnp.full(5, 0.0))
+    save_policy(tmp_path / "huge.npz", Policy(jax.tree.map(huge, params), stats, meta))
+    loaded = load_policy(tmp_path / "huge.npz")
+    carry = init_carry(loaded)
+    for obs in (np.zeros(5), np.full(5, -1e30)):
+        carry, action = act(loaded, carry, jnp.float32(obs))
+        assert np.isfinite(action).all()
+
+
+@pytest.mark.parametrize("change", [{"iteration": "7"}, {"iteration": -1}, {"seed": 0.5}])
+def test_counts_that_are_none(saved, change):
+    with np.load(saved) as file:
+        metadata = json.loads(str(file["metadata"]))
+    _rewrite(saved, metadata=json.dumps({**metadata, **change}))
+    _refused(saved, "{path}: not a policy file of mcx_jax (no metadata of its kind)")
+
+
+@pytest.mark.parametrize(("read", "given"), [(38, 3), (39, 7), (5, 6), (37, 6), (40, 6)])
+def test_a_policy_of_another_task_is_refused_by_name(read, given):
+    with pytest.raises(UserError) as error:
+        require_task("other.npz", PolicyMeta(obs_size=read, action_size=given, hidden=4))
+    assert str(error.value) == (
+        f"other.npz: reads {read} numbers and gives {given}; a policy for this task reads 38 or 39 "
+        "and gives 6"
+    )
+
+
+def test_no_command_takes_a_policy_of_another_task(saved):
+    """One of three actions ended `evaluate` in a ValueError, after its compilation."""
+    with pytest.raises(UserError, match="reads 5 numbers and gives 3; a policy for this task"):
+        load_controller(str(saved))
+    for observed in (38, 39):
+        require_task("right.npz", PolicyMeta(obs_size=observed, action_size=6, hidden=4))

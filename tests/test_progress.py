@@ -5,6 +5,7 @@ import json
 import os
 import signal
 import struct
+import time
 from dataclasses import replace
 
 import pytest
@@ -58,17 +59,77 @@ def test_means_over_the_seas():
     ],
 )
 def test_no_reference_where_table_3_has_none(config):
-    assert references(config) == ("", "")
+    assert references(config) == ""
 
 
-def test_line_says_how_good_that_is():
+def test_errors_of_training_and_the_papers_are_named_for_what_they_are():
+    out = io.StringIO()
+    Progress(_config(), 0, out).begin()
+    said = " ".join(out.getvalue().split())
+    assert "dp, da: errors of training episodes, with exploration" in said
+    # Table 3, B4_4, means over the four seas.
+    assert said.endswith(
+        "its trained agents 0.71 mm 0.73 mrad, the baseline that they imply 5.88 mm 4.72 mrad"
+    )
+    Progress(_config("E3"), 0, out := io.StringIO()).begin()
+    assert "table 3" not in out.getvalue()
+
+
+def test_line_says_how_far_and_how_good():
     line = Progress(_config(), start_iteration=0, out=io.StringIO()).line([ROW])
-    begin = "3/306 | dp 2.35 mm (IK 5.88, paper 0.71) | da 1.23 mrad (IK 4.72, paper 0.73) | ETA "
-    assert line.startswith(begin)
-    assert "| 0.20 M steps, " in line and "\n" not in line and "sigma" not in line
-    assert " | sigma 0.300" in Progress(_config(), 0).line([{**ROW, "sigma": 0.3}])
-    line = Progress(replace(_config("E3"), seeds=2), 0).line([ROW, {**ROW, "pos_error_mm": 4.0}])
-    assert line.startswith("3/306 | dp 2.35 4.00 mm | da 1.23 1.23 mrad | ETA ")
+    assert line.startswith("3/306 | ETA ")
+    assert " | training dp 2.35 mm | da 1.23 mrad | 0.20 M steps | " in line
+    assert "\n" not in line and "sigma" not in line
+    assert line.endswith("/s") and "IK" not in line
+    assert Progress(_config(), 0).line([{**ROW, "sigma": 0.3}]).endswith(" | sigma 0.300")
+    several = [{**ROW, "pos_error_mm": x} for x in (3.0, 2.0, 4.0)]
+    line = Progress(replace(_config("E3"), seeds=3), 0).line(several)
+    assert " | training dp 2.00 to 4.00 mm | da 1.23 mrad | " in line
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.mark.parametrize("columns", [20, 40, 80, 120])
+def test_line_fits_the_terminal_and_keeps_its_end_of_time(columns, monkeypatch):
+    """At 80 columns the ETA used to be cut off; what does not fit is left out whole."""
+    monkeypatch.setenv("COLUMNS", str(columns))
+    worst = {**ROW, "pos_error_mm": 123.456, "ang_error_mrad": 1234.5, "sigma": 0.3}
+    best = {**worst, "pos_error_mm": 2.0, "ang_error_mrad": 3.0}
+    rows = [{**row, "rejected_share": 0.0} for row in (worst, *7 * [best])]
+    config, out = replace(_config(), seeds=8), Terminal()
+    Progress(config, 0, out, begun=time.monotonic() - 9000).show(rows)
+    line = out.getvalue().removeprefix("\r\x1b[K")
+    assert len(line) < columns
+    parts = line.split(" | ")
+    assert parts[0] == "3/306"
+    whole = ["da 3.00 to 1234.50 mrad", " M steps", "/s", "sigma 0.300"]  # what may come at the end
+    assert all(part.endswith(end) for part, end in zip(parts[3:], whole, strict=False))
+    if columns >= 40:
+        assert parts[1].startswith("ETA ") and parts[1].endswith(" min")
+    if columns >= 80:
+        assert parts[2] == "training dp 2.00 to 123.46 mm"
+    if columns >= 120:
+        assert len(parts) == 7
+
+
+def test_a_warning_does_not_stick_to_the_line_of_progress(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    progress = Progress(_config(), 0, out := Terminal())
+    for share in (0.0, 0.9):
+        progress.show([{**ROW, "rejected_share": share}])
+    assert "\r\x1b[Kwarning: 90 % of the windows" in out.getvalue()
+
+
+def test_a_terminal_is_not_empty_during_the_first_iteration(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    Progress(_config(), 4, out := Terminal()).begin()
+    assert out.getvalue().splitlines()[-1] == "4/306 | first iteration"
+    assert max(map(len, out.getvalue().splitlines())) <= 80
+    Progress(_config(), 306, out := Terminal()).begin()
+    assert out.getvalue() == ""  # nothing left to do
 
 
 def _make_env(env_config, motion_config, split):

@@ -6,6 +6,7 @@ import scipy.stats
 
 from mcx_jax import results
 from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
+from mcx_jax.errors import UserError
 from mcx_jax.paper import is_papers_world, table3
 from mcx_jax.results import WARM_UP_STEPS, bootstrap_interval, effort, interquartile_mean
 
@@ -169,3 +170,22 @@ def test_effort_by_hand():
     assert found["torque_share"] == pytest.approx({"mean": 0.375, "at_limit": 1 / 6})
     share[-2] = np.nan  # a diverged point is no point
     assert effort(correction, share)["torque_share"]["at_limit"] == pytest.approx(1 / 4)
+
+
+@pytest.mark.filterwarnings("error")
+def test_effort_of_nothing_finite_is_refused_not_nan():
+    steps = results.LEAST_STEPS
+    correction, share = np.zeros((steps, 6, 2)), np.full((steps, 2), 0.25)
+    assert effort(correction, share)["correction"]["rate_cm_s"] == 0.0
+    for bad, good in ((correction * np.nan, share), (correction, share * np.nan)):
+        with pytest.raises(UserError, match="in any episode is a finite number: nothing to report"):
+            effort(bad, good)
+    # One step after the warm-up has no rate, which was a NaN and a warning.
+    with pytest.raises(UserError, match="no correction in any episode is a finite number"):
+        effort(correction[:-1], share[:-1])
+
+
+def test_errors_beyond_all_numbers_are_refused():
+    pos_m = np.full((WARM_UP_STEPS + 2, 1), np.float32(3e37))
+    with pytest.raises(UserError, match="ik, E1, Wb: errors beyond all numbers"):
+        results.row("ik", "E1", "Wb", pos_m, pos_m, np.array([False]))
