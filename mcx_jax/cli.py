@@ -36,8 +36,10 @@ def parse(
         default: defaults other than the class's own.
 
     Raises:
-        UserError: unknown flag, missing value, value of the wrong kind or out of range.
+        UserError: unknown flag, missing value, value of the wrong kind or out of range, a flag
+            given twice.
     """
+    _refuse_repeats(argv)
     kwargs: dict[str, Any] = {} if default is None else {"default": default}
     said = io.StringIO()
     _check_names(argv)
@@ -68,6 +70,18 @@ def _check_names(argv: Sequence[str]) -> None:
             name.encode()
         except UnicodeEncodeError:
             raise UserError(f"{name}: is not UTF-8; use a name that is") from None
+
+
+def _refuse_repeats(argv: Sequence[str]) -> None:
+    """tyro takes the last of two values in silence; which of them is meant only the user knows."""
+    given: set[str] = set()
+    for word in argv:
+        if not word.startswith("--"):
+            continue
+        flag = word.split("=", 1)[0].replace("_", "-").replace("--no-", "--", 1)
+        if flag in given:
+            raise UserError(f"{flag} is given twice; leave one of them out")
+        given.add(flag)
 
 
 def _one_line(box: str) -> str:
@@ -112,7 +126,8 @@ def _box_text(box: str) -> str:
 
 
 def value_of(argv: Sequence[str], flag: str) -> str | None:
-    """Value of a flag that other defaults hang on, read before the real parsing; the last wins."""
+    """Value of a flag that other defaults hang on, read before the real parsing, which refuses a
+    flag that is given twice; the last of them."""
     value = None
     for i, word in enumerate(argv):
         if word.startswith(f"{flag}="):

@@ -4,6 +4,7 @@ A controller is `init(env, state) -> memory` and `act(env, state, memory) -> (me
 for ONE episode; a trained policy has the same two functions (`mcx_jax.policy.PolicyController`).
 """
 
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import jax
@@ -15,6 +16,7 @@ from mcx_jax.envs.state import EnvState
 from mcx_jax.envs.v2v import ACTION_SCALE, V2VEnv
 from mcx_jax.spatial import (
     Mat,
+    Scalar,
     Vec,
     exp_rotation,
     log_rotation,
@@ -27,6 +29,7 @@ from mcx_jax.spatial import (
     vscale,
     vsub,
 )
+from mcx_jax.stage import stage
 
 HOLD_LEAD_S = 0.010
 """A reference is held for 20 ms; on average it is 10 ms old when the arm follows it."""
@@ -73,12 +76,12 @@ class Extrapolate:
     def act(self, env: V2VEnv, state: EnvState, memory):
         """Move the goal by lead / 20 ms times its last change."""
         steps = (_lead_s(env, self.lead_s) + state.conditions.age_s) / CONTROL_DT_S
-        r, p = state.measured.pose
+        now = state.measured.pose
         r_old, p_old = unpack_matrix(memory[0]), unpack(memory[1], 3)
-        turn = vscale(steps, log_rotation(matmul(r, transpose(r_old))))
-        ahead = matmul(exp_rotation(turn), r), vadd(p, vscale(steps, vsub(p, p_old)))  # type: ignore[arg-type]
+        turn = turn_of(now[0], transpose(r_old), env.wall)
+        change = (*vscale(steps, vsub(now[1], p_old)), *vscale(steps, turn))
         memory = state.measured.rotation, state.measured.position
-        return memory, correction((r, p), ahead)  # type: ignore[arg-type]
+        return memory, correction(now, moved(now, change, env.wall), env.wall)
 
 
 @struct.dataclass
@@ -96,18 +99,36 @@ class Preview:
     def act(self, env: V2VEnv, state: EnvState, memory: tuple[()]):
         """Aim at the pose that the goal will have."""
         lead = round(_lead_s(env, self.lead_s) / PHYSICS_DT_S)
-        return memory, correction(state.measured.pose, env.goal_ahead(state, lead))
+        return memory, correction(state.measured.pose, env.goal_ahead(state, lead), env.wall)
 
 
 def _lead_s(env: V2VEnv, lead_s: Any) -> Any:
     return env.known_delay.group_delay_s + HOLD_LEAD_S if lead_s is None else lead_s
 
 
-def correction(now: tuple[Mat, Vec], wanted: tuple[Mat, Vec]) -> jax.Array:
+def moved(pose: tuple[Mat, Vec], change: Sequence[Scalar], wall: jax.Array | None):
+    """A goal's pose in B after a change in B's axes: 3 m, 3 rad (rotation vector).
+
+    Args:
+        wall: see `mcx_jax.stage`. Without walls XLA computed a controller's rotations again for
+            every number of its action: a control step of `extrapolate` took 28 times a policy's.
+    """
+    turn = stage(wall, exp_rotation, tuple(change[3:]))
+    return stage(wall, matmul, turn, pose[0]), vadd(pose[1], tuple(change[:3]))  # type: ignore[arg-type]
+
+
+def correction(
+    now: tuple[Mat, Vec], wanted: tuple[Mat, Vec], wall: jax.Array | None = None
+) -> jax.Array:
     """(6,) action that turns goal pose `now` into `wanted`, cm and crad in the goal's axes."""
-    shift = tmatvec(now[0], vsub(wanted[1], now[1]))
-    turn = log_rotation(matmul(transpose(now[0]), wanted[0]))
+    shift = stage(wall, tmatvec, now[0], vsub(wanted[1], now[1]))
+    turn = turn_of(transpose(now[0]), wanted[0], wall)
     return jnp.stack([*shift, *turn]) / ACTION_SCALE
+
+
+def turn_of(a: Mat, b: Mat, wall: jax.Array | None = None) -> Vec:
+    """Rotation vector of a b, rad."""
+    return stage(wall, log_rotation, stage(wall, matmul, a, b))
 
 
 CLASSICAL = {"ik": IK(), "extrapolate": Extrapolate(), "preview": Preview()}

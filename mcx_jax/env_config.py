@@ -152,15 +152,21 @@ class MotionConfig:
     Several with commas between them: one drawn per episode. Ending in -coupled (Wa-coupled): both
     vessels in one wave field in that sea."""
     motion: str = ""
-    """Recorded motion instead of the generator: .npy or .csv, columns t,x,y,z,roll,pitch,yaw."""
+    """Recorded motion instead of the generator: .npy or .csv, columns t,x,y,z,roll,pitch,yaw (in
+    any order where a .csv names them)."""
     motion_length_unit: Literal["m", "mm"] = "m"
     """Unit of x, y, z in --motion (the authors' files: mm)."""
     motion_angle_unit: Literal["rad", "deg"] = "rad"
     """Unit of roll, pitch, yaw in --motion (the authors' files: deg)."""
     motion_scale: float = 1.0
     """Froude scale of --motion: lengths are divided by it, time by its root (already scaled: 1)."""
+    motion_axes: Literal["auto", "earth", "ship"] = field(default="auto", metadata={"added": True})
+    """Axes of x, y in --motion: earth (fixed, those that yaw is counted from; turned into the axes
+    of the mean heading), ship (the mean heading's already). auto = the same thing within 5 deg of
+    mean yaw; beyond, you are asked."""
     coupled: bool = False
-    """Both vessels in one wave field in every sea (the paper: independent windows)."""
+    """Both vessels in one wave field in every sea (the paper: independent windows). Not a floating
+    arrangement: their midships are 1.5 m apart, one hull inside the other."""
     split: Literal["seeds", "paper"] = "seeds"
     """Test motion: another wave seed (seeds), or the last third of the same hour (paper)."""
 
@@ -174,6 +180,12 @@ class MotionConfig:
             not (self.motion and self.sea != "all"),
             f"--sea {self.sea} has no meaning with --motion: a recording is one sea; leave one out",
         )
+        for name in ("motion_length_unit", "motion_angle_unit", "motion_scale", "motion_axes"):
+            value, usual = getattr(self, name), getattr(MotionConfig, name)
+            require(
+                bool(self.motion) or value == usual,
+                f"--{name.replace('_', '-')} {value} has no meaning without --motion; leave it out",
+            )
         require(
             not (self.motion and self.coupled),
             "--coupled has no meaning with --motion: one recording holds one vessel; leave one out",

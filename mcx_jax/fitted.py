@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from mcx_jax.controllers import HOLD_LEAD_S, Extrapolate, correction
+from mcx_jax.controllers import HOLD_LEAD_S, Extrapolate, correction, moved, turn_of
 from mcx_jax.delay import PHYSICS_DT_S, SUBSTEPS
 from mcx_jax.envs import conditions
 from mcx_jax.envs.motion import LOOK_AHEAD_STEPS
@@ -25,13 +25,11 @@ from mcx_jax.episodes import episode_errors
 from mcx_jax.errors import UserError
 from mcx_jax.results import WARM_UP_STEPS
 from mcx_jax.spatial import (
-    exp_rotation,
     log_rotation,
     matmul,
     transpose,
     unpack,
     unpack_matrix,
-    vadd,
 )
 from mcx_jax.terminal import silent
 
@@ -62,23 +60,25 @@ class Fir:
         memory = jnp.concatenate([memory[1:], _flat(state.measured)[None]])
         latency = state.conditions.latency
         weights = self.weights[0] if latency is None else self.weights[latency]
-        change = unpack(features(memory) @ weights, 6)
-        r, p = state.measured.pose
-        ahead = matmul(exp_rotation(change[3:]), r), vadd(p, change[:3])  # type: ignore[arg-type]
-        return memory, correction((r, p), ahead)
+        change = unpack(features(memory, env.wall) @ weights, 6)
+        now = state.measured.pose
+        return memory, correction(now, moved(now, change, env.wall), env.wall)
 
 
 def _flat(measured: conditions.Measurement) -> jax.Array:
     return jnp.concatenate([measured.rotation.ravel(), measured.position])
 
 
-def features(poses: jax.Array) -> jax.Array:
-    """(6 (TAPS - 1),) changes from the last TAPS - 1 poses to the present one, m and rad in B."""
+def features(poses: jax.Array, wall: jax.Array | None = None) -> jax.Array:
+    """(6 (TAPS - 1),) changes from the last TAPS - 1 poses to the present one, m and rad in B.
+
+    Args:
+        poses: (TAPS, 12).
+        wall: see `mcx_jax.stage`.
+    """
     r, p = poses[:, :9].reshape(-1, 3, 3), poses[:, 9:]
     now = unpack_matrix(r[-1])
-    turns = jax.vmap(
-        lambda old: jnp.stack(log_rotation(matmul(now, transpose(unpack_matrix(old)))))
-    )
+    turns = jax.vmap(lambda old: jnp.stack(turn_of(now, transpose(unpack_matrix(old)), wall)))
     return jnp.concatenate([(p[-1] - p[:-1]).ravel(), turns(r[:-1]).ravel()])
 
 

@@ -38,6 +38,9 @@ def test_flags_are_flat():
         ("--num-envs", "--num-envs needs a value"),
         ("--num-env 5", "unknown option --num-env 5: did you mean --num-envs? --help lists all"),
         ("--qqq 3", "unknown option --qqq 3: --help lists all"),
+        ("--sea Wa --sea Wb", "--sea is given twice; leave one of them out"),
+        ("--coupled --no-coupled", "--coupled is given twice; leave one of them out"),
+        ("--num_envs=64 --num-envs 64", "--num-envs is given twice; leave one of them out"),
         ("fast", "unknown option fast: --help lists all"),
         ("--seed -1", "--seed -1: must be 0 or a positive integer"),
         (

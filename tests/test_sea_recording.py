@@ -1,11 +1,12 @@
 """Recorded motion: formats, units, scale, and one clear line for every bad file."""
 
+import jax
 import numpy as np
 import pytest
 
 from mcx_jax.config import TrainConfig
 from mcx_jax.env_config import MotionConfig
-from mcx_jax.envs.motion import load_motion
+from mcx_jax.envs.motion import draw_track, load_motion
 from mcx_jax.errors import UserError
 from mcx_jax.sea.recording import MIN_DURATION_S, load_recording, split_recording
 from mcx_jax.sea.spectrum import SEAS
@@ -61,6 +62,64 @@ def test_header_bom_and_windows_lines(tmp_path):
     check(load_recording(path))
 
 
+def test_columns_are_found_by_their_names(tmp_path, capsys):
+    order = [3, 1, 2, 6, 4, 0, 5]
+    names = 'heave, Surge,SWAY,"yaw",roll,time,pitch'
+    data = record(rate_hz=50.0)[:, order]
+    check(load_recording(save(tmp_path / "r.csv", data, header=names)))
+    assert capsys.readouterr().err == ""
+    names = names.replace("yaw", "heading")
+    check(load_recording(save(tmp_path / "h.csv", data, header=names)))
+    assert "heading is read as yaw, which grows to PORT" in capsys.readouterr().err
+
+
+def earth_log(yaw):
+    """The motion of `record` on a ship whose mean heading is `yaw`, with x and y of the earth."""
+    data = record()
+    x, y = data[:, 1].copy(), data[:, 2].copy()
+    data[:, 1] = 400.0 + np.cos(yaw) * x - np.sin(yaw) * y
+    data[:, 2] = -90.0 + np.sin(yaw) * x + np.cos(yaw) * y
+    data[:, 6] = (data[:, 6] + yaw + np.pi) % (2 * np.pi) - np.pi  # as a compass jumps
+    return data
+
+
+@pytest.mark.parametrize("degrees", [75.0, -20.0, 180.0])
+def test_positions_in_earth_axes_are_turned_into_the_heading(tmp_path, capsys, degrees):
+    path = save(tmp_path / "r.npy", earth_log(np.radians(degrees)))
+    check(load_recording(path, axes="earth"))
+    assert "r.npy: x and y turned by " in capsys.readouterr().err
+
+
+def test_where_the_axes_matter_the_user_is_asked(tmp_path):
+    data = record()
+    data[:, 6] += np.radians(75.0)
+    path = save(tmp_path / "r.npy", data)
+    _refused(
+        path,
+        "the mean yaw is 75 deg; are x and y along the earth's axes, from which yaw is counted "
+        "(give --motion-axes earth), or along the ship's (ship)?",
+    )
+    check(load_recording(path, axes="ship"))
+    data[:, 6] -= np.radians(71.0)
+    check(load_recording(save(tmp_path / "r.npy", data)))  # 4 deg: nearly the same thing
+
+
+def test_drift_and_a_forgotten_scale_are_pointed_out(tmp_path, capsys):
+    load_recording(save(tmp_path / "good.npy", record()))
+    assert capsys.readouterr().err == ""
+    drifting = record()
+    drifting[:, 2] += 0.25 * np.sin(2 * np.pi * drifting[:, 0] / 38.0)  # station keeping, 120 s
+    load_recording(save(tmp_path / "drifting.npy", drifting))
+    assert "drifting.npy: y: most of this motion is slower than 10 s" in capsys.readouterr().err
+    full = record()
+    full[:, 1:4] *= 20.0
+    load_recording(save(tmp_path / "full.npy", full))
+    said = capsys.readouterr().err
+    assert "moves up to 0.8" in said and "is it at full scale (--motion-scale 10)?" in said
+    load_recording(save(tmp_path / "under_way.npy", full), scale=1.02)
+    assert "is the scale right?" in capsys.readouterr().err
+
+
 def test_authors_format(tmp_path):
     # .npy, mm, degrees, 100 Hz, already scaled, float32; hours into a run
     data = record(start_s=3000.0)
@@ -103,10 +162,43 @@ def test_constant_offsets_go_but_list_and_trim_stay(tmp_path):
     data = record()
     data[:, 1:] += [100.0, -50.0, 3.0, 0.04, -0.02, np.pi]
     data[:, 6] = (data[:, 6] + np.pi) % (2 * np.pi) - np.pi  # a compass that jumps at 180 deg
-    tables = load_recording(save(tmp_path / "r.npy", data))
+    tables = load_recording(save(tmp_path / "r.npy", data), axes="ship")
     mean = tables.knots[0, :, :6].mean(axis=0)
     np.testing.assert_allclose(mean, [0, 0, 0, 0.04, -0.02, 0], atol=1e-3)  # see `check`
     assert abs(tables.knots[0, :, 5]).max() < 0.011
+
+
+def windows(tmp_path, capsys, duration_s):
+    """Test motion of a recording so long, and what was said of it."""
+    path = save(tmp_path / f"{duration_s:.0f}.npy", record(duration_s, 20.0))
+    motion = load_motion(MotionConfig(motion=str(path)), 1000, "test")
+    return motion, capsys.readouterr().err
+
+
+def test_independent_windows_of_a_short_recording_are_counted(tmp_path, capsys):
+    motion, said = windows(tmp_path, capsys, 139.0)  # 26.4 s to test: starts of 0 to 4.3 s
+    assert motion.independent_windows(1000) == 1 and motion.apart_steps == 0
+    assert "139.npy: the test part holds 1 independent windows of 20 s; below 20 " in said
+    assert "should have 420 s of laboratory time" in said
+    assert "both vessels move nearly alike" in said
+    motion, said = windows(tmp_path, capsys, 1330.0)  # 423 s, of which 2 s are looked ahead
+    assert motion.independent_windows(1000) == 21
+    assert said.endswith("the test part holds 21 independent windows of 20 s\n")
+    load_motion(MotionConfig(sea="Wa"), 1000, "test")
+    assert capsys.readouterr().err == ""
+
+
+def test_windows_of_a_recording_are_15_s_apart_where_it_is_long_enough(tmp_path, capsys):
+    motion, _ = windows(tmp_path, capsys, 270.0)  # starts of 0 to 48 s
+    uniform = jax.random.uniform(jax.random.key(0), (20_000, 4))
+    track = jax.vmap(draw_track, in_axes=(None, 0))(motion, uniform)
+    a, b = np.asarray(track.start_a) // 10, np.asarray(track.start_b) // 10
+    assert abs(a - b).min() == 750 and min(a.min(), b.min()) == 0
+    assert max(a.max(), b.max()) == motion.last_start
+    # Every allowed start of B, given A, is as likely as another: half of them in each half.
+    near_start = a < 200  # allowed: a + 750 .. last_start
+    middle = (a[near_start] + 750 + motion.last_start) / 2
+    assert abs(np.mean(b[near_start] < middle) - 0.5) < 0.05  # 1,700 draws: 0.012, four of them
 
 
 def test_split_two_thirds_one_third(tmp_path):
@@ -174,7 +266,8 @@ BAD_ARRAYS = {
     ),
     "millimetres": (
         _edit(lambda d: d.__imul__([1, 1e3, 1e3, 1e3, 1, 1, 1])),
-        "x moves 20.13 m from its mean; at laboratory scale at most 10 m can be: is it in mm?",
+        "x moves 20.13 m from its mean; at laboratory scale at most 10 m can be: is it in mm, at "
+        "full scale (give --motion-scale, e.g. 10), or under way (take speed and drift off with",
     ),
     "complex": (np.zeros((9, 7), complex), "not readable as .npy array of numbers"),
     "pickle": (np.array([[{}] * 7]), "not readable as .npy array of numbers (pickled objects are"),
@@ -197,14 +290,33 @@ BAD_BYTES = {
     "random.npy": (bytes(range(256)), "not readable as .npy array of numbers"),
     "cut.npy": (b"\x93NUMPY\x01\x00", "not readable as .npy array of numbers"),
     "random.csv": (bytes(range(256)), "not readable as .csv text; it needs lines of 7 numbers"),
-    "text.csv": (b"t,x\n1,2\n3,abc\n", "not all entries are numbers (could not convert string"),
+    "text.csv": (
+        b"t,x,y,z,roll,pitch,yaw\n1,2,0,0,0,0,0\n3,abc,0,0,0,0,0\n",
+        "not all entries are numbers (could not convert string",
+    ),
+    "unit.csv": (
+        b"t,x,y,z,roll,pitch,yaw\ns,m,m,m,rad,rad,rad\n0,0,0,0,0,0,0\n",
+        "not all entries are numbers (could not convert string to float: 's')",
+    ),
+    "unknown.csv": (
+        b"ms,surge,sway,heave,roll,pitch,yaw\n0,0,0,0,0,0,0\n",
+        "column 'ms' is not known; name the columns, with commas between them and in any order, t "
+        "(or time), x (surge), y (sway), z (heave), roll, pitch, yaw (heading)",
+    ),
+    "with_unit.csv": (b"t,x [mm],y,z,roll,pitch,yaw\n0,0,0,0,0,0,0\n", "column 'x [mm]' is not"),
+    "twice.csv": (b"t,x,surge,z,roll,pitch,yaw\n0,0,0,0,0,0,0\n", "column 'surge' is a second x"),
+    "missing.csv": (b"t,x,y,z,roll,pitch\n0,0,0,0,0,0\n", "the header names no column yaw; needed"),
+    "longer.csv": (
+        b"t,x,y,z,roll,pitch,yaw\n0,0,0,0,0,0,0,0\n",
+        "the header names 7 columns, a line has 8",
+    ),
     "ragged.csv": (
         b"0,0,0,0,0,0,0\n0,0,0\n",
         "data line 2 has 3 columns, the first has 7; every line needs t,x,y,z,roll,pitch,yaw",
     ),
     "semicolon.csv": (
         b"0;0;0;0;0;0;0\n1;0;0;0;0;0;0\n",
-        "not all entries are numbers (could not convert string to float: '1;0;0;0;0;0;0')",
+        "column '0;0;0;0;0;0;0' is not known; name the columns, with commas between them",
     ),
     "log.txt": (b"0,0,0,0,0,0,0\n", "unknown kind of file; a recording is .npy or .csv"),
 }

@@ -17,8 +17,10 @@ from mcx_jax.sea.spectrum import (
     jonswap,
     parse_sea,
     spreading_weights,
+    steepest_hs_m,
     two_parameter_gamma,
 )
+from mcx_jax.sea.tables import doubts
 
 VALID = "use Wa, Wb, Wc, Wd or Hs:Tp in metres and seconds at full scale, e.g. 3.0:11"
 # The response of section 5's checks: head seas, motion of midship at the waterline.
@@ -79,6 +81,37 @@ def test_parse_refuses(text, message):
     with pytest.raises(UserError) as error:
         parse_sea(text)
     assert str(error.value) == message
+
+
+def test_the_steepest_sea_is_dnvs():
+    # Hs / (g Tp^2 / 2 pi) = 1/15 up to 8 s, 1/25 from 15 s on; 11.5 s is halfway: 0.8/15.
+    length_m = lambda tp_s: 9.81 * tp_s**2 / (2 * np.pi)  # noqa: E731
+    for tp_s, steepness in ((5.0, 1 / 15), (8.0, 1 / 15), (11.5, 0.8 / 15), (15.0, 1 / 25)):
+        assert steepest_hs_m(tp_s) == pytest.approx(steepness * length_m(tp_s))
+
+
+@pytest.mark.parametrize(
+    ("sea", "coupled", "lines"),
+    [
+        ("Wa", False, []),
+        ("Wd", False, []),
+        ("3.7:6", False, []),
+        (
+            "3.8:6",
+            False,
+            ["sea 3.8:6: steeper than seas get: at Tp 6 s DNV-RP-C205 has Hs up to 3.7 m"],
+        ),
+        # 7.9 % at 3 s, 1.1 % at 5 s, 0.5 % at 6 s: measured with wavespectra and with this band
+        ("0.5:3", False, ["sea 0.5:3: Hs is 7.9 % low, as waves shorter than 2 s are left out"]),
+        ("1:5", False, ["sea 1:5: Hs is 1.1 % low"]),
+        ("3.5:4", False, ["steeper than seas get", "Hs is 2.6 % low"]),
+        ("Wd-coupled", True, ["sea Wd-coupled, coupled: not a floating arrangement"]),
+    ],
+)
+def test_what_is_doubtful_of_a_sea_is_said(sea, coupled, lines):
+    said = doubts(parse_sea(sea), coupled)
+    assert len(said) == len(lines), said
+    assert all(want in line for want, line in zip(lines, said, strict=True)), said
 
 
 def test_missing_asset_is_a_user_error():

@@ -9,11 +9,18 @@ from flax import struct
 from mcx_jax.delay import CONTROL_DT_S, SUBSTEPS
 from mcx_jax.env_config import MotionConfig
 from mcx_jax.errors import UserError
+from mcx_jax.notice import notice
 from mcx_jax.sea.sampler import KNOT_STEPS
 
 NAMED_SEAS = ("Wa", "Wb", "Wc", "Wd")
 LOOK_AHEAD_STEPS = 100
 """Control steps that stay readable after an episode's end (2 s), for the `preview` bound."""
+
+APART_STEPS = 750
+"""Control steps (15 s) after which a vessel's motion has forgotten itself (`SPLIT_GAP_S`): two
+vessels that take windows of one short recording are kept that far apart."""
+ENOUGH_WINDOWS = 20
+"""Independent windows of motion below which test errors are called uncertain."""
 
 
 @struct.dataclass
@@ -32,6 +39,14 @@ class Motion:
     """Latest window start, control steps of 20 ms (inclusive); the earliest is 0."""
     coupled: tuple[bool, ...] = struct.field(pytree_node=False)
     """Of each sea: both vessels use the same window (one wave field)."""
+    apart_steps: int = struct.field(pytree_node=False, default=0)
+    """Control steps by which the starts of the two windows differ at least. 0 in generated seas: in
+    an hour of waves fewer than 1 % of the pairs are nearer than 15 s."""
+
+    def independent_windows(self, episode_steps: int) -> int:
+        """How many windows of an episode's length, but of 15 s at least, a table holds one after
+        the other."""
+        return self.last_start // max(episode_steps, APART_STEPS) + 1
 
 
 @struct.dataclass
@@ -47,7 +62,7 @@ class Track:
 
 
 def draw_track(motion: Motion, uniform: jax.Array, sea: jax.Array | int | None = None) -> Track:
-    """Independent random windows of one table for the two vessels.
+    """Independent random windows of one table for the two vessels, `motion.apart_steps` apart.
 
     Args:
         uniform: (4,) numbers in [0, 1): sea, seed, start of A, start of B. One draw serves a
@@ -58,17 +73,29 @@ def draw_track(motion: Motion, uniform: jax.Array, sea: jax.Array | int | None =
         sea = _pick(uniform[0], len(motion.seas))
     seed = _pick(uniform[1], motion.seeds)
     starts = motion.last_start + 1
-    start_a = SUBSTEPS * _pick(uniform[2], starts)
-    start_b = SUBSTEPS * _pick(uniform[3], starts)
+    a = _pick(uniform[2], starts)
+    start_a = SUBSTEPS * a
+    if motion.apart_steps:
+        start_b = SUBSTEPS * _pick_apart(uniform[3], a, motion)
+    else:
+        start_b = SUBSTEPS * _pick(uniform[3], starts)
     if any(motion.coupled):
         start_b = jnp.where(jnp.asarray(motion.coupled)[sea], start_a, start_b)
     table = jnp.asarray(sea * motion.seeds + seed, jnp.int32)
     return Track(table=table, start_a=start_a, start_b=start_b)
 
 
-def _pick(uniform: jax.Array, count: int) -> jax.Array:
+def _pick(uniform: jax.Array, count: int | jax.Array) -> jax.Array:
     """An int32 in [0, count); float32 has 2^23 steps, forty times an hour of starts."""
     return jnp.minimum(jnp.floor(uniform * count).astype(jnp.int32), count - 1)
+
+
+def _pick_apart(uniform: jax.Array, a: jax.Array, motion: Motion) -> jax.Array:
+    """An int32 in [0, last_start], at least apart_steps from a; all such are equally likely."""
+    before = jnp.maximum(a - motion.apart_steps + 1, 0)
+    after = jnp.maximum(motion.last_start - (a + motion.apart_steps) + 1, 0)
+    k = _pick(uniform, before + after)
+    return jnp.where(k < before, k, k - before + a + motion.apart_steps)
 
 
 def load_motion(
@@ -91,23 +118,48 @@ def load_motion(
             f"and 2 s of look-ahead do not fit into {knots_a.shape[1] * 0.1:g} s of motion"
         )
     device_a = jnp.asarray(knots_a, jnp.float32)
-    return Motion(
+    # Shorter ones have starts that are near all others.
+    long = bool(config.motion) and last_start >= 2 * APART_STEPS
+    motion = Motion(
         knots_a=device_a,
         knots_b=device_a if knots_b is None else jnp.asarray(knots_b, jnp.float32),
         seas=names,
         seeds=knots_a.shape[0] // len(names),
         last_start=last_start,
         coupled=coupled,
+        apart_steps=APART_STEPS if long else 0,
     )
+    if config.motion and split == "test":
+        _tell_windows(config.motion, motion, episode_steps)
+    return motion
+
+
+def _tell_windows(path: str, motion: Motion, episode_steps: int) -> None:
+    """Say how much motion the test episodes of a recording have, whatever their number."""
+    count = motion.independent_windows(episode_steps)
+    episode_s = max(episode_steps, APART_STEPS) * CONTROL_DT_S
+    said = f"{path}: the test part holds {count} independent windows of {episode_s:g} s"
+    if count < ENOUGH_WINDOWS:
+        seconds = (ENOUGH_WINDOWS + 1) * episode_s
+        said += (
+            f"; below {ENOUGH_WINDOWS} the errors are those of these few, more episodes repeat "
+            f"them: record longer (the last third should have {seconds:.0f} s of laboratory time)"
+        )
+    if not motion.apart_steps:
+        said += "; both vessels move nearly alike, as it is too short for windows 15 s apart"
+    notice(said)
 
 
 def _generated(config: MotionConfig, split: Literal["train", "test"]):
     from mcx_jax.sea.spectrum import parse_sea
-    from mcx_jax.sea.tables import build_tables
+    from mcx_jax.sea.tables import build_tables, doubts
 
     names = NAMED_SEAS if config.sea == "all" else tuple(config.sea.split(","))
     seas = [parse_sea(name) for name in names]
     coupled = tuple(config.is_coupled(name) for name in names)
+    for sea, together in zip(seas, coupled, strict=True):
+        for line in doubts(sea, together):
+            notice(line)
     tables = build_tables(seas, split, coupled=coupled, split=config.split)
     return tables.sea_names, tables.knots, tables.companion, coupled
 
@@ -120,6 +172,7 @@ def _recorded(config: MotionConfig, split: Literal["train", "test"]):
         length_unit=config.motion_length_unit,
         angle_unit=config.motion_angle_unit,
         scale=config.motion_scale,
+        axes=config.motion_axes,
     )
     train, test = split_recording(tables)
     return ("motion",), (train if split == "train" else test).knots, None, (False,)

@@ -192,7 +192,7 @@ class V2VEnv:
     ) -> tuple[Mat, Vec]:
         """The TRUE pose T_G^B at a physics step of an episode."""
         place = self.goal_on_deck(goal_m, drawn, step)
-        return vessels.goal_pose(self.motion, track, place, step)
+        return vessels.goal_pose(self.motion, track, place, step, self.wall)
 
     def goal_ahead(self, state: EnvState, steps: jax.Array | int) -> tuple[Mat, Vec]:
         """The TRUE pose T_G^B a number of physics steps after now."""

@@ -119,15 +119,22 @@ def goal_in_base(
     return matmul(matmul(to_base, r_b), GOAL_ROTATION), matvec(to_base, vsub(goal, p_a))
 
 
-def goal_pose(motion: Motion, track: Track, goal_m: jax.Array, step: jax.Array) -> tuple[Mat, Vec]:
+def goal_pose(
+    motion: Motion,
+    track: Track,
+    goal_m: jax.Array,
+    step: jax.Array,
+    wall: jax.Array | None = None,
+) -> tuple[Mat, Vec]:
     """T_G^B at a physics step counted from the episode's beginning.
 
     Args:
         goal_m: (3,) position of the goal on vessel B at that step, m.
+        wall: see `mcx_jax.stage`.
     """
-    seg_a = segment(motion.knots_a, track.table, track.start_a + step)
-    seg_b = segment(motion.knots_b, track.table, track.start_b + step)
-    return goal_in_base(seg_a, seg_b, goal_m, 0)
+    seg_a = segment(motion.knots_a, track.table, track.start_a + step, wall)
+    seg_b = segment(motion.knots_b, track.table, track.start_b + step, wall)
+    return stage(wall, goal_in_base, seg_a, seg_b, goal_m, 0)
 
 
 def draw_goal(uniform: jax.Array) -> jax.Array:

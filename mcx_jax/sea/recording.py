@@ -1,15 +1,19 @@
 """Recorded vessel motion (a motion reference unit's log, or another simulator) as motion tables.
 
-File: .npy or .csv, columns t, x, y, z, roll, pitch, yaw; t in seconds. Axes x forward, y to port,
-z up; R = Rz(yaw) Ry(pitch) Rx(roll). The authors' format: .npy, mm, degrees, 100 Hz, already
-scaled.
+File: .npy or .csv, columns t, x, y, z, roll, pitch, yaw; a .csv may name them in its first line and
+then have them in any order (`NAMES`). t in seconds. Axes x forward, y to port, z up;
+R = Rz(yaw) Ry(pitch) Rx(roll). The authors' format: .npy, mm, degrees, 100 Hz, already scaled.
 
-What is done to it: units, Froude scale, yaw unwrapped, the mean of x, y, z and yaw taken off, cubic
-spline to knots every 0.1 s. The means go because the rest poses of the vessels are the task's, not
-the log's: the x and y of a GPS, the heave datum of a sensor and a compass heading say where the
-ship was, and added to the rest pose they would put it out of the arm's reach. The mean of roll and
-pitch stays: list and trim are real. Motion above 5 Hz (laboratory time) is not carried by the
-knots; filter a noisy log before.
+What is done to it: units, Froude scale, yaw unwrapped, the mean of x, y, z and yaw taken off, x and
+y turned into the axes of the mean heading, cubic spline to knots every 0.1 s. The means go because
+the rest poses of the vessels are the task's, not the log's: the x and y of a GPS, the heave datum
+of a sensor and a compass heading say where the ship was, and added to the rest pose they would put
+it out of the arm's reach. The mean of roll and pitch stays: list and trim are real. Motion above
+5 Hz (laboratory time) is not carried by the knots; filter a noisy log before.
+
+Whether x and y are along the earth's axes or the ship's cannot be seen in the numbers. Where the
+mean yaw is within `_LIKE_AXES_RAD` both are nearly the same and nothing is turned; beyond it the
+user has to say (`axes`).
 """
 
 import math
@@ -21,9 +25,19 @@ from typing import Literal
 import numpy as np
 
 from mcx_jax.errors import UserError
+from mcx_jax.notice import notice
 from mcx_jax.sea.tables import KNOT_DT_S, SPLIT_GAP_S, MotionTables
 
 COLUMNS = ("t", "x", "y", "z", "roll", "pitch", "yaw")
+NAMES = {name: name for name in COLUMNS} | {
+    "time": "t",
+    "surge": "x",
+    "sway": "y",
+    "heave": "z",
+    "heading": "yaw",
+}
+"""Names that a header may give the columns."""
+Axes = Literal["auto", "earth", "ship"]
 MIN_RATE_HZ = 10.0
 # A third of it, less the gap at the border, must still hold an episode of 20.5 s and the 2 s that
 # controllers may look ahead.
@@ -33,6 +47,14 @@ MIN_DURATION_S = 128.0
 _MAX_DISPLACEMENT_M = 10.0
 _MAX_TILT_RAD = math.radians(45.0)
 _MAX_YAW_RAD = math.pi
+# Below it the two readings of x and y differ by a part of sin(5 deg) = 9 %.
+_LIKE_AXES_RAD = math.radians(5.0)
+# Wd, the paper's roughest sea, moves its vessel up to 0.4 m; a UR10e reaches 1.1 m.
+_LIKELY_DISPLACEMENT_M = 0.6
+# Means over blocks of this length hold nearly nothing of waves, whose periods are below 6 s in the
+# laboratory (a swell of 6.3 s keeps 19 %), and nearly all of drift and station keeping.
+_SLOW_S = 10.0
+_SLOW_M_OR_RAD = 0.02
 # Time stamps may be off by this part of a step: float32 seconds after an hour are, by 2 %.
 _MAX_UNEVENNESS = 0.05
 
@@ -42,15 +64,18 @@ def load_recording(
     length_unit: Literal["m", "mm"] = "m",
     angle_unit: Literal["rad", "deg"] = "rad",
     scale: float = 1.0,
+    axes: Axes = "auto",
     min_duration_s: float = MIN_DURATION_S,
 ) -> MotionTables:
     """One recording as a single motion table, not periodic.
 
     Args:
-        path: .npy (n, 7) or .csv with 7 columns and an optional header line.
+        path: .npy (n, 7) or .csv with 7 columns and an optional header line that names them.
         length_unit: of x, y, z.
         angle_unit: of roll, pitch, yaw.
         scale: Froude scale lambda; lengths are divided by it, time by its root. 1 = already scaled.
+        axes: of x and y. earth: those that yaw is counted from; they are turned by the mean yaw.
+            ship: those of the mean heading. auto: as they are, where the mean yaw is within 5 deg.
         min_duration_s: shortest recording accepted, after scaling.
 
     Returns:
@@ -63,11 +88,11 @@ def load_recording(
     if not (math.isfinite(scale) and scale > 0):
         raise UserError(f"{path}: the Froude scale is {scale:g}; it must be positive, e.g. 10")
     with np.errstate(over="ignore", invalid="ignore"):  # refused below, in words
-        return _load(path, length_unit, angle_unit, scale, min_duration_s)
+        return _load(path, length_unit, angle_unit, scale, axes, min_duration_s)
 
 
 def _load(
-    path: Path, length_unit: str, angle_unit: str, scale: float, min_duration_s: float
+    path: Path, length_unit: str, angle_unit: str, scale: float, axes: Axes, min_duration_s: float
 ) -> MotionTables:
     data = _checked_numbers(path, _read(path))
     time_s = _checked_time(path, data[:, 0] / math.sqrt(scale), scale, min_duration_s)
@@ -75,15 +100,61 @@ def _load(
     motion[:, :3] *= {"m": 1.0, "mm": 1e-3}[length_unit] / scale
     motion[:, 3:] *= {"rad": 1.0, "deg": math.pi / 180.0}[angle_unit]
     motion[:, 5] = np.unwrap(motion[:, 5])
+    mean_yaw = motion[:, 5].mean()
     for column in (0, 1, 2, 5):
         motion[:, column] -= motion[:, column].mean()
-    _check_units(path, motion, length_unit, angle_unit)
+    _check_units(path, motion, length_unit, angle_unit, scale)
+    _turn_to_heading(path, motion, math.remainder(mean_yaw, 2.0 * math.pi), axes)
+    _advise(path, time_s, motion, scale)
     return MotionTables(
         knots=_resample(time_s, motion)[None],
         companion=None,
         sea_index=np.zeros(1, np.int32),
         sea_names=(path.name,),
     )
+
+
+def _turn_to_heading(path: Path, motion: np.ndarray, mean_yaw: float, axes: Axes) -> None:
+    """Turn x and y, in place, into the axes of the mean heading.
+
+    Args:
+        motion: (n, 6) m, rad, means removed.
+        mean_yaw: rad, within half a turn. It is the circular mean as well: yaw was unwrapped.
+    """
+    degrees = math.degrees(mean_yaw)
+    if axes == "auto" and abs(mean_yaw) > _LIKE_AXES_RAD:
+        raise UserError(
+            f"{path}: the mean yaw is {degrees:.0f} deg; are x and y along the earth's axes, from "
+            "which yaw is counted (give --motion-axes earth), or along the ship's (ship)?"
+        )
+    if axes != "earth":
+        return
+    x, y = motion[:, 0].copy(), motion[:, 1].copy()
+    motion[:, 0] = math.cos(mean_yaw) * x + math.sin(mean_yaw) * y
+    motion[:, 1] = math.cos(mean_yaw) * y - math.sin(mean_yaw) * x
+    notice(f"{path}: x and y turned by {degrees:.1f} deg, from the earth's axes to the heading's")
+
+
+def _advise(path: Path, time_s: np.ndarray, motion: np.ndarray, scale: float) -> None:
+    """Say what can be read but is likely not meant. motion: (n, 6) m, rad, means removed."""
+    block = max(1, round(_SLOW_S * (len(time_s) - 1) / (time_s[-1] - time_s[0])))
+    whole = len(motion) // block * block
+    slow = motion[:whole].reshape(-1, block, 6).mean(axis=1).std(axis=0)
+    drifts = (slow > _SLOW_M_OR_RAD) & (slow > 0.5 * motion.std(axis=0))
+    names = [name for name, drift in zip(COLUMNS[1:], drifts, strict=True) if drift]
+    if names:
+        notice(
+            f"{path}: {', '.join(names)}: most of this motion is slower than {_SLOW_S:g} s of "
+            "laboratory time, no waves; drift carries the goal out of the arm's reach: take it off "
+            "with a high-pass filter (docs/own-data.md)"
+        )
+    peak = np.abs(motion[:, :3]).max()
+    if peak > _LIKELY_DISPLACEMENT_M:
+        ask = "is it at full scale (--motion-scale 10)?" if scale == 1 else "is the scale right?"
+        notice(
+            f"{path}: moves up to {peak:.2f} m from its mean, the roughest sea of the paper 0.4 m, "
+            f"and an arm like the UR10e reaches 1.1 m: {ask}"
+        )
 
 
 def split_recording(tables: MotionTables) -> tuple[MotionTables, MotionTables]:
@@ -137,12 +208,14 @@ def _read_npy(path: Path) -> np.ndarray:
 def _read_csv(path: Path) -> np.ndarray:
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
-        lines = [line for line in lines if line.strip()]
-        rows = [line.split(",") for line in (lines[1:] if _is_header(lines[:1]) else lines)]
+        rows = [line.split(",") for line in lines if line.strip()]
     except (UnicodeDecodeError, OSError):
         raise UserError(
             f"{path}: not readable as .csv text; it needs lines of 7 numbers separated by commas"
         ) from None
+    order = list(range(len(rows[0]))) if rows else []
+    if _is_header(rows[:1]):
+        order = _column_order(path, rows.pop(0))
     if not rows:
         raise UserError(f"{path}: holds no numbers; it needs columns {','.join(COLUMNS)}")
     for number, row in enumerate(rows, 1):
@@ -151,8 +224,10 @@ def _read_csv(path: Path) -> np.ndarray:
                 f"{path}: data line {number} has {len(row)} columns, the first has {len(rows[0])}; "
                 f"every line needs {','.join(COLUMNS)}"
             )
+    if len(order) != len(rows[0]):
+        raise UserError(f"{path}: the header names {len(order)} columns, a line has {len(rows[0])}")
     try:
-        return np.array(rows, dtype=float)
+        return np.array(rows, dtype=float)[:, order]
     except ValueError as error:
         raise UserError(
             f"{path}: not all entries are numbers ({error}); it needs 7 numbers a line separated "
@@ -160,13 +235,37 @@ def _read_csv(path: Path) -> np.ndarray:
         ) from None
 
 
-def _is_header(lines: list[str]) -> bool:
+def _is_header(rows: list[list[str]]) -> bool:
     """Whether the first line is text: it holds an entry that is no number and no gap."""
     try:
-        [float(entry) for line in lines for entry in line.split(",") if entry.strip()]
+        [float(entry) for row in rows for entry in row if entry.strip()]
     except ValueError:
         return True
     return False
+
+
+def _column_order(path: Path, header: list[str]) -> list[int]:
+    """Where the header has each of COLUMNS."""
+    places: dict[str, int] = {}
+    for place, entry in enumerate(header):
+        word = entry.strip().strip("\"'").lower()
+        name = NAMES.get(word)
+        if name is None or name in places:
+            problem = "is not known" if name is None else f"is a second {name}"
+            raise UserError(
+                f"{path}: column {entry.strip()!r} {problem}; name the columns, with commas "
+                "between them and in any order, t (or time), x (surge), y (sway), z (heave), roll, "
+                "pitch, yaw (heading)"
+            )
+        if word == "heading":
+            notice(f"{path}: heading is read as yaw, which grows to PORT; turn a compass's sign")
+        places[name] = place
+    missing = [name for name in COLUMNS if name not in places]
+    if missing:
+        raise UserError(
+            f"{path}: the header names no column {missing[0]}; needed are {','.join(COLUMNS)}"
+        )
+    return [places[name] for name in COLUMNS]
 
 
 def _checked_numbers(path: Path, data: np.ndarray) -> np.ndarray:
@@ -216,15 +315,19 @@ def _checked_time(path: Path, time_s: np.ndarray, scale: float, min_s: float) ->
     return even
 
 
-def _check_units(path: Path, motion: np.ndarray, length_unit: str, angle_unit: str) -> None:
+def _check_units(
+    path: Path, motion: np.ndarray, length_unit: str, angle_unit: str, scale: float
+) -> None:
     """Refuse numbers that cannot be what their unit says. motion: (n, 6) m, rad, means removed."""
     peaks = np.abs(motion).max(axis=0)
     for name, peak in zip(COLUMNS[1:4], peaks[:3], strict=True):
         if not peak <= _MAX_DISPLACEMENT_M:  # also catches the NaN of an overflow
-            hint = "is it in mm?" if length_unit == "m" else "is it in micrometres?"
+            unit = "mm" if length_unit == "m" else "micrometres"
+            full = " at full scale (give --motion-scale, e.g. 10)," if scale == 1 else ""
             raise UserError(
                 f"{path}: {name} moves {peak:.4g} m from its mean; at laboratory scale at most "
-                f"{_MAX_DISPLACEMENT_M:g} m can be: {hint} or at full scale (give scale, e.g. 10)?"
+                f"{_MAX_DISPLACEMENT_M:g} m can be: is it in {unit},{full} or under way (take "
+                "speed and drift off with a high-pass filter)?"
             )
     limits = (_MAX_TILT_RAD, _MAX_TILT_RAD, _MAX_YAW_RAD)
     for name, peak, limit in zip(COLUMNS[4:], peaks[3:], limits, strict=True):

@@ -15,7 +15,10 @@ from mcx_jax.errors import UserError
 
 GRAVITY_M_S2 = 9.81
 
-# A deep-water wave breaks at a height of 1/7 of its length; a sea of that steepness is none.
+# A single deep-water wave breaks at a height of 1/7 of its length. A sea whose SIGNIFICANT height
+# is that steep does not exist; it is refused. What lies between this and `steepest_hs_m` is
+# simulated, with a line that says so: linear waves have no limit of their own, and a limit of
+# statistics is no reason to take an experiment away.
 _MAX_STEEPNESS = 1.0 / 7.0
 # The vessel's response is known from 0.2 to 3.2 rad/s (periods 2 to 31 s): beyond these peak
 # periods a good part of the waves would fall outside.
@@ -54,7 +57,7 @@ def parse_sea(text: str) -> SeaState:
             "-coupled" stays in the name and is the same sea.
 
     Raises:
-        UserError: neither, or no sea that water can carry.
+        UserError: neither, or no sea that water can carry (Hs of 1/7 of the wave length at Tp).
     """
     sea = text.removesuffix(COUPLED)
     if sea in SEAS:
@@ -70,13 +73,24 @@ def parse_sea(text: str) -> SeaState:
         raise UserError(
             f"sea state {text!r}: Hs must be positive and Tp {low_s:g} to {high_s:g} s; {valid}"
         )
-    steepest_m = _MAX_STEEPNESS * GRAVITY_M_S2 * tp_s**2 / (2 * math.pi)
+    steepest_m = _MAX_STEEPNESS * peak_length_m(tp_s)
     if hs_m > steepest_m:
         raise UserError(
             f"sea state {text!r}: waves of {tp_s:g} s break above Hs {steepest_m:.1f} m; "
             f"lower Hs or lengthen Tp"
         )
     return SeaState(hs_m, tp_s, text)
+
+
+def peak_length_m(tp_s: float) -> float:
+    """Length of a deep-water wave of the peak period, metres."""
+    return GRAVITY_M_S2 * tp_s**2 / (2 * math.pi)
+
+
+def steepest_hs_m(tp_s: float) -> float:
+    """The highest Hs of a sea state by DNV-RP-C205 (section 3.5.4), metres: 1/15 of the wave length
+    at Tp up to 8 s, 1/25 from 15 s on, the steepness linear between."""
+    return float(np.interp(tp_s, [8.0, 15.0], [1.0 / 15.0, 1.0 / 25.0])) * peak_length_m(tp_s)
 
 
 def two_parameter_gamma(hs_m: float, tp_s: float) -> float:

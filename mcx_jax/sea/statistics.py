@@ -1,7 +1,9 @@
 """Motion statistics of a sea state: how fast the goal moves, seen from the arm's base.
 
-The paper's table 1 lists, per sea state, the mean speed and the mean angular rate of the goal. They
-are the only published figures about its motion data, so the generator is calibrated against them.
+The paper's table 1 lists, per sea state, the mean speed and the mean angular rate of the goal. The
+generator is calibrated against these eight figures. The authors' recordings themselves are in their
+repository (github.com/sherilan/exposed-mcx, `exposed/data`), without a licence: they are neither
+shipped nor used here, and nothing here was compared with their spectra.
 """
 
 from collections.abc import Sequence
