@@ -102,7 +102,8 @@ def _refuse(m: mjx.Model) -> None:
         m.nhistory == 0,
         "mjx_step: the model has delayed actuators or sensors; take the delay out of the MJCF file",
     )
-    view: dict[str, Any] = {f.name: getattr(m, f.name) for f in fields(m)}
+    names = (f.name for f in fields(m))  # type: ignore[arg-type]
+    view: dict[str, Any] = {name: getattr(m, name) for name in names}
     for name, value in view.items():
         if isinstance(value, Tracer):
             view[name] = np.zeros(value.shape)

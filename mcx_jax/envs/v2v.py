@@ -6,7 +6,7 @@ Pure, jittable, vmappable, differentiable. `vmap` it with the batch axis last
 
 from dataclasses import replace
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -41,7 +41,7 @@ class V2VEnv:
     """The task's constants. Pass it through jit as an argument: it holds the tables of motion."""
 
     motion: Motion
-    mjx_model: object
+    mjx_model: Any
     """mjx.Model for --physics mjx, else None."""
     wall: jax.Array | None
     """() bool, true: keeps XLA on CPU from recomputing stages (mcx_jax.stage); None on a GPU."""
