@@ -116,7 +116,7 @@ PAPER_PPO = PPOConfig(
     value_target="discounted",
     initial_sigma=1.3132616875182228,
 )
-"""The paper's schedule to the letter (facts: networks and training). sigma = softplus(1)."""
+"""The paper's schedule to the letter. sigma = softplus(1)."""
 
 
 @dataclass(frozen=True)

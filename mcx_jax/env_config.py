@@ -106,7 +106,7 @@ class EnvConfig:
     """Engine: chain (this project's, fast) or mjx (MuJoCo's own, the reference)."""
     integrator: Literal["model", "euler", "implicitfast", "quiet", "mixed"] = "model"
     """Integrator of the arm; model = as the arm's file says (paper: euler, ur10e: implicitfast);
-    quiet = implicitfast as it was before MuJoCo 3.5, the one that does not chatter; mixed = euler
+    quiet = implicitfast as it was before MuJoCo 3.5, the one with the least chatter; mixed = euler
     or quiet, drawn per episode."""
     episode_steps: int = 1000
     """Control steps of 20 ms in an episode."""

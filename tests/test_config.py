@@ -71,7 +71,7 @@ def test_the_papers_cutoffs_as_shares_of_nyquist():
     [("E0", 0.0), ("E1", 20.0), ("E2", 40.0), ("B4_21", 7.1), ("B4_4", 34.1)],
 )
 def test_group_delay_of_the_named_delays(name, milliseconds):
-    # The figures of the facts, to their last digit.
+    # The authors' figures, to their last digit.
     assert 1e3 * parse_delay(name).group_delay_s == pytest.approx(milliseconds, abs=0.05)
 
 

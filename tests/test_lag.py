@@ -1,6 +1,8 @@
 """Delays: the queue by hand, the filter against scipy for any order and cutoff, a settled start."""
 
 import functools
+import math
+import re
 
 import jax
 import jax.numpy as jnp
@@ -79,6 +81,38 @@ def test_second_order_step_by_hand():
     step = jnp.ones((4, 1))
     got = run(parse_delay("butter:2:12.5Hz"), jnp.zeros(1), step)
     np.testing.assert_allclose(got[:, 0], [0.292893, 0.878680, 1.121320, 1.020815], atol=1e-6)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4, 7])
+def test_sections_are_those_of_docs_equations(order, repo_root):
+    """The page's formulas, evaluated as they stand there."""
+    text = (repo_root / "docs" / "equations.md").read_text()
+    block = re.search(r"^pair i(.*?)^start +(.*?)  +v:", text, re.MULTILINE | re.DOTALL)
+    assert block
+    names = {"f": 10.4, "T": CONTROL_DT_S, "pi": math.pi, "sin": math.sin, "tan": math.tan}
+    pair, odd = block[1].split("odd order   one more section:")
+
+    def section(formulas: str, i: int) -> list[float]:
+        """b0, b1, b2, a1, a2 of formulas in which a space is a product; in the order needed."""
+        found = dict(names, n=order, i=i)
+        parts = [part.strip() for part in re.split(r",  |\n", formulas) if "=" in part]
+        for part in sorted(parts, key=lambda part: "kdcba".index(part[0])):
+            *targets, formula = part.split(" = ")
+            formula = re.sub(r"(?<=[\w)]) (?=[\w(])", " * ", formula.replace("^", "**"))
+            found |= dict.fromkeys(targets, eval(formula, {}, found))
+        return [found[name] for name in ("b0", "b1", "b2", "a1", "a2")]
+
+    wanted = [section(pair, i) for i in range(order // 2)]
+    k = "k = tan(pi f T)"
+    wanted += [section(f"{k},  {odd}", 0)] * (order % 2)
+    got = lag.sections(Delay("literal", order=order, cutoff_hz=10.4))
+    np.testing.assert_allclose(got, wanted, rtol=1e-12)  # the same numbers, summed in another order
+    state = lag.init(Delay("literal", order=order, cutoff_hz=10.4), jnp.ones(1)).sections
+    starts = block[2].split(",  ")
+    assert starts == ["s1 = (1 - b0) v", "s2 = (b2 - a2) v"]
+    np.testing.assert_allclose(
+        state[..., 0], [[1 - b0, b2 - a2] for b0, _, b2, _, a2 in wanted], rtol=1e-6
+    )
 
 
 def test_sections_are_cached_plain_numbers():

@@ -68,7 +68,7 @@ def apply_one(
 def init(delay: Delay, first: jax.Array) -> LagState:
     """Settled on the first input: a queue full of it, and the filter in steady state.
 
-    Until k references have arrived the queue thus returns its oldest entry, the first one (facts).
+    Until k references have arrived the queue thus returns its oldest entry, the first one.
 
     Args:
         first: (nq,) joint reference, rad.

@@ -1,6 +1,6 @@
 """Policy and value network: normalised observation -> 2 x dense tanh -> LSTM with a skip -> head.
 
-Both are separate networks with the same torso (paper; facts of the authors' code). All methods take
+Both are separate networks with the same torso (paper; authors' code). All methods take
 NORMALISED observations (`ppo.normalise`) and leave batch axes in front: step (..., F), unroll
 (T, B, F).
 """
