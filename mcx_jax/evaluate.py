@@ -206,8 +206,8 @@ def main(argv: list[str] | None = None) -> None:
     for line in startup.configure(config.device, mjx=config.env.physics == "mjx"):
         print(line, file=report)
     print(config.env.describe_delays(), file=report)
-    who, controller = load_controller(config.who)
     with working("preparing the vessels' motion", report) as say:
+        who, controller = load_controller(config.who)
         env = informed(evaluation_env(config.env, config.motion), config.known_delay)
         task = config.env, config.motion, config.known_delay
         controller = fit_if_needed(who, controller, *task, say)

@@ -205,14 +205,14 @@ def train(
 def _train(
     run: RunDir, make_env: Callable[..., Any], events: bool, checkpoint_interval_s: float
 ) -> "Policy":
-    from mcx_jax.programs import prepare
-
     config = run.config
     begun = time.monotonic()
-    env = make_env(config.env, config.motion, split="train")
-    first = None if run.start_iteration else first_policy(config, env)
-    ready = time.monotonic()
-    with working("compiling") as say:
+    with working("preparing the vessels' motion") as say:
+        from mcx_jax.programs import prepare
+
+        env = make_env(config.env, config.motion, split="train")
+        first = None if run.start_iteration else first_policy(config, env)
+        ready = time.monotonic()
         say("compiling (1 to 2 min the first time)")
         training = prepare(config, env)
     print(
