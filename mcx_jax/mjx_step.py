@@ -18,8 +18,8 @@ from jax.core import Tracer
 
 from mcx_jax.envs import dynamics
 from mcx_jax.envs.fields import refuse_unsupported
+from mcx_jax.envs.mjx_engine import on_device
 from mcx_jax.envs.model import with_joints_carrying_servos
-from mcx_jax.errors import UserError, reason
 from mcx_jax.mjx_model import Arm, compose, read
 from mcx_jax.quiet_mjx import mjx
 from mcx_jax.spatial import (
@@ -53,10 +53,7 @@ def put_model(mj: mujoco.MjModel) -> mjx.Model:
     refuse_unsupported(springless)
     whole = with_joints_carrying_servos(mj)
     mujoco.mj_setConst(whole, mujoco.MjData(whole))  # `read` compares dof_M0
-    try:
-        return mjx.put_model(whole)
-    except NotImplementedError as error:
-        raise UserError(f"MJX cannot take this arm model: {reason(error)}") from None
+    return on_device(whole)
 
 
 def step(m: mjx.Model, d: mjx.Data) -> mjx.Data:

@@ -321,3 +321,12 @@ def test_armature_that_mjx_dropped_is_refused_where_it_can_be_seen(arm_without_s
         read(mjx.put_model(arm_without_sensors))
     with pytest.raises(UserError, match="delayed actuators or sensors"):
         read(mjx.put_model(mujoco.MjModel.from_xml_string(delayed)))
+
+
+@pytest.mark.parametrize("put", [put_model, lambda mj: mjx_engine.put_model(mj, "euler")])
+def test_what_mjx_lacks_is_a_line(put):
+    xml = XML.replace("<worldbody>", '<option><flag energy="enable"/></option><worldbody>')
+    mj = mujoco.MjModel.from_xml_string(xml)
+    chain_model(mj)
+    with pytest.raises(UserError, match="MJX cannot take this arm model: mjtEnableBit.*ENERGY"):
+        put(mj)

@@ -15,6 +15,7 @@ from jax import lax
 
 from mcx_jax.envs.dynamics import BaseState
 from mcx_jax.envs.model import with_joints_carrying_servos
+from mcx_jax.errors import UserError, reason
 from mcx_jax.quiet_mjx import mjx
 
 INTEGRATORS = {
@@ -25,7 +26,11 @@ INTEGRATORS = {
 
 
 def put_model(mj: mujoco.MjModel, integrator: str) -> mjx.Model:
-    """The model on the device: zero gravity, wanted integrator, no contact or constraint work."""
+    """The model on the device: zero gravity, wanted integrator, no contact or constraint work.
+
+    Raises:
+        UserError: as `on_device`.
+    """
     mj = with_joints_carrying_servos(mj)
     mj.opt.gravity[:] = 0.0
     mj.opt.integrator = INTEGRATORS[integrator]
@@ -35,7 +40,22 @@ def put_model(mj: mujoco.MjModel, integrator: str) -> mjx.Model:
     if mj.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
         mj.actuator_ctrllimited[:] = False
     mj.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL)
-    return mjx.put_model(mj)
+    return on_device(mj)
+
+
+def on_device(mj: mujoco.MjModel) -> mjx.Model:
+    """`mjx.put_model`.
+
+    Raises:
+        UserError: MJX lacks something that C MuJoCo has.
+    """
+    try:
+        return mjx.put_model(mj)
+    except NotImplementedError as error:
+        raise UserError(
+            f"MJX cannot take this arm model: {reason(error)}; take that out of the MJCF file, or "
+            "use --physics chain"
+        ) from None
 
 
 def servo(
