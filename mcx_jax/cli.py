@@ -84,6 +84,27 @@ def _refuse_repeats(argv: Sequence[str]) -> None:
         given.add(flag)
 
 
+def flags(config: Any, default: Any, leave_out: tuple[str, ...] = ()) -> list[str]:
+    """The command line that `parse` reads as `config`.
+
+    Args:
+        config: a dataclass of settings, without positional ones.
+        default: of the same class; what is equal there is left out.
+        leave_out: names of fields.
+    """
+    words: list[str] = []
+    for name in (f.name for f in dataclasses.fields(config) if f.name not in leave_out):
+        ours, theirs = getattr(config, name), getattr(default, name)
+        flag = name.replace("_", "-")
+        if dataclasses.is_dataclass(ours):
+            words += flags(ours, theirs, leave_out)
+        elif ours != theirs and isinstance(ours, bool):
+            words.append(f"--{flag}" if ours else f"--no-{flag}")
+        elif ours != theirs:
+            words += [f"--{flag}", str(ours)]
+    return words
+
+
 def _one_line(box: str) -> str:
     """The message inside tyro's box, in our words where tyro speaks Python."""
     text = _box_text(box)

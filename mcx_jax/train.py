@@ -31,7 +31,7 @@ from mcx_jax.run_dir import (
     open_new,
     stored_config,
 )
-from mcx_jax.training import rest, train
+from mcx_jax.training import rest, table_motion, train
 
 if TYPE_CHECKING:
     from mcx_jax.policy import Policy
@@ -137,24 +137,13 @@ def read_command(argv: list[str]) -> tuple[TrainCommand, RunDir]:
         _refuse_unused(command.train, defaults)
         _refuse_no_policy(command.train.start_from)
         run = open_new(_directory(command), command.train)
-        run.options = _options(command)
+        run.options = tuple(cli.flags(command, TrainCommand(), STORED))
         return command, run
     path = Path(command.run_dir) if command.run_dir else default_path(command.train)
     command = parse(default=TrainCommand(train=stored_config(path)))
     run = open_existing(path, command.train, command.resume_from)
-    run.options = _options(command)
+    run.options = tuple(cli.flags(command, TrainCommand(), STORED))
     return command, run
-
-
-def _options(command: TrainCommand) -> tuple[str, ...]:
-    """The flags that change a run and are not in its configuration."""
-    words: list[str] = []
-    for setting in fields(TrainCommand):
-        value = getattr(command, setting.name)
-        if setting.name not in STORED and value != setting.default:
-            flag = f"--{setting.name.replace('_', '-')}"
-            words += [flag] if value is True else [flag, str(value)]
-    return tuple(words)
 
 
 def _directory(command: TrainCommand) -> Path:
@@ -178,8 +167,7 @@ def final_table(config: TrainConfig, policy: "Policy", episodes: int, steps: int
     from mcx_jax.result_table import print_table
     from mcx_jax.terminal import working
 
-    named = config.motion.sea in ("all", "Wa", "Wb", "Wc", "Wd")
-    motion = replace(config.motion, sea="all") if named else config.motion
+    motion = table_motion(config)
     env = replace(config.env, episode_steps=steps)
     controller = PolicyController(policy)
     with working("evaluating on test motion") as say:

@@ -7,10 +7,12 @@ import contextlib
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from mcx_jax import checkpoint, cli, command, hosts, streams, tensorboard
 from mcx_jax.config import TrainConfig
+from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.errors import UserError
 from mcx_jax.progress import Progress, short_time
 from mcx_jax.run_dir import CONFIG, POLICY, RunDir, writing
@@ -207,6 +209,8 @@ def _train(
 ) -> "Policy":
     config = run.config
     begun = time.monotonic()
+    if config.iterations * config.steps_per_iteration != config.total_steps:
+        print(rounded_up(config))
     with working("preparing the vessels' motion") as say:
         from mcx_jax.programs import prepare
 
@@ -228,8 +232,6 @@ def _train(
     hosts.agree(0)  # the others read what it has cut
     if run.start_iteration:
         print(f"going on after iteration {run.start_iteration}")
-    elif config.iterations * config.steps_per_iteration != config.total_steps:
-        print(rounded_up(config))
     with contextlib.ExitStack() as stack:
         file = None
         if events:
@@ -242,6 +244,23 @@ def _train(
         print(f"saved after iteration {policy.meta.iteration} of {config.iterations}; {rest(run)}")
         raise SystemExit(128 + stop.signum)
     return policy
+
+
+def table_motion(config: TrainConfig) -> MotionConfig:
+    """The motion of a run's final table: all four seas, if it was trained on one of them."""
+    named = config.motion.sea in ("all", "Wa", "Wb", "Wc", "Wd")
+    return replace(config.motion, sea="all") if named else config.motion
+
+
+def table_line(run: RunDir) -> str:
+    """The command that makes the table of a finished run."""
+    task = (run.config.env, EnvConfig()), (table_motion(run.config), MotionConfig())
+    words = [word for ours, theirs in task for word in cli.flags(ours, theirs, UNUSED)]
+    return command.line("evaluate", run.path, *words)
+
+
+UNUSED = ("episode_steps",)
+"""Of a run's task, what its table does not use."""
 
 
 def rounded_up(config: TrainConfig) -> str:
@@ -257,7 +276,7 @@ def rest(run: RunDir) -> str:
     """What is left to do after the last checkpoint, and the command that does it."""
     last = checkpoint.latest(run.path)
     if last == run.config.iterations:
-        return f"make the table with:\n{command.line('evaluate', run.path)}"
+        return f"make the table with:\n{table_line(run)}"
     if last:
         return f"go on from iteration {last} with:\n{run.resume_line}"
     if (run.path / CONFIG).exists():

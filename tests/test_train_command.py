@@ -31,7 +31,7 @@ from mcx_jax.run_dir import RunDir, default_path, open_existing, open_new
 from mcx_jax.stop import StopRequest
 from mcx_jax.streams import Guarded
 from mcx_jax.train import compile_quickly, main, read_command
-from mcx_jax.training import first_policy, rest, rounded_up, train
+from mcx_jax.training import first_policy, rest, rounded_up, table_line, train
 
 CONFIG = replace(
     preset_config("fast"),
@@ -241,6 +241,18 @@ def test_the_command_that_resumes_has_the_flags_of_the_run(tmp_path):
     (run.path / "checkpoints" / "7").mkdir(parents=True)
     assert rest(run) == f"go on from iteration 7 with:\n{run.resume_line}"
     assert rest(RunDir(tmp_path, CONFIG)) == "the run had not begun, nothing is saved"
+
+
+def test_the_command_that_makes_the_table_is_of_the_runs_task(tmp_path):
+    """Its delay, seas and conditions, which `evaluate` does not read from a run."""
+    from mcx_jax.evaluate import EvaluateConfig
+
+    flags = ["--smoke", "--delay", "E1", "--noise-mm", "0:3", "--sea", "Wd", "--coupled"]
+    _, run = read_command([*flags, "--run-dir", str(tmp_path / "run")])
+    asked = cli.parse(EvaluateConfig, shlex.split(table_line(run))[3:], prog="evaluate")
+    assert asked.who == str(run.path)
+    assert asked.env == replace(run.config.env, episode_steps=1000)
+    assert asked.motion == replace(run.config.motion, sea="all")
 
 
 def test_steps_that_are_no_whole_number_of_iterations_are_rounded_up_aloud():
