@@ -85,6 +85,7 @@ def test_a_command_in_its_own_process_gives_the_same_json(ik_rows, tmp_path):
     done = command("ik", *options, "--episodes", str(EPISODES), "--json", str(out))
     assert done.returncode == 0, done.stderr
     assert "E2: explicit delay of 2 control steps = 40 ms" in done.stdout
+    assert "compiling (up to 2 min the first time) and running 12 episodes\n" in done.stdout
     got = json.loads(out.read_text())
     assert [row["sea"] for row in got] == [row["sea"] for row in ik_rows]
     for a, b in zip(got, ik_rows, strict=True):
