@@ -4,6 +4,12 @@ LONGEST = 1000
 """Characters of a message; of a longer one, which quotes what it was given, the middle goes."""
 
 
+def printable(text: str) -> str:
+    """`text` in one line: what cannot be printed (line ends, colours, bytes of no encoding) is
+    escaped."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
 class UserError(Exception):
     """A mistake in what the user asked for.
 
@@ -13,9 +19,7 @@ class UserError(Exception):
     """
 
     def __str__(self) -> str:
-        text = "".join(
-            c if c.isprintable() else c.encode("unicode_escape").decode() for c in super().__str__()
-        )
+        text = printable(super().__str__())
         if len(text) <= LONGEST:
             return text
         return f"{text[: LONGEST // 2]} ... {text[-LONGEST // 3 :]}"
