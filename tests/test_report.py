@@ -6,13 +6,16 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
+import browser
 import jax
 import numpy as np
 import pytest
 
-from mcx_jax import cli, episodes, extras
+from mcx_jax import cli, episodes, extras, palette
 from mcx_jax.config import TrainConfig
 from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
 from mcx_jax.envs.model import torque_limits_nm
@@ -22,11 +25,13 @@ from mcx_jax.paper import table3
 from mcx_jax.policy import Policy, PolicyMeta, save_policy
 from mcx_jax.ppo.networks import init_params
 from mcx_jax.ppo.normalise import init_stats
-from mcx_jax.report import entries, style
+from mcx_jax.report import build, entries, figures, sections, style
 from mcx_jax.report.__main__ import main
-from mcx_jax.report.episode import lag_s, record
+from mcx_jax.report.episode import Episode, lag_s, record
 from mcx_jax.report.folder import check_out, write
 from mcx_jax.report.noise import noise_sweep
+from mcx_jax.report.page import page
+from mcx_jax.report.sections import Section
 from mcx_jax.report.spectra import motion_spectra
 from mcx_jax.report.table import table
 from mcx_jax.roster import load_controller
@@ -73,14 +78,15 @@ class Page(HTMLParser):
 
     def __init__(self, text):
         super().__init__(convert_charrefs=True)
-        self.open, self.tags, self.images, self.cells, self.text = [], [], [], [], ""
+        self.open, self.tags, self.cells, self.text = [], [], [], ""
         self.feed(text)
         self.close()
+        self.images = [a for tag, a in self.tags if tag == "svg"]
+        self.ids = [a["id"] for _, a in self.tags if "id" in a]
+        self.links = [a["href"] for _, a in self.tags if "href" in a]
 
     def handle_starttag(self, tag, attrs):
         self.tags.append((tag, dict(attrs)))
-        if tag == "img":
-            self.images.append(dict(attrs))
         if tag in ("td", "th"):
             self.cells.append("")
         if tag not in self.VOID:
@@ -111,17 +117,36 @@ def test_page_parses_and_holds_every_figure(made, html):
     wanted += tuple(f"spectrum_{c}" for c in ("surge", "sway", "heave", "roll", "pitch", "yaw"))
     assert pngs == sorted(f"{name}.png" for name in wanted)
     assert len(page.images) == len(pngs)
-    assert all(i["src"].startswith("data:image/png;base64,iVBOR") and i["alt"] for i in page.images)
+    assert all(image["role"] == "img" and image["aria-label"] for image in page.images)
     for said in ("python -m mcx_jax.report", "jax", "matplotlib", "CPU cores", '"delay": "E2"'):
         assert said in page.text, said
 
 
+def test_contents_lead_to_every_section(html):
+    page = Page(html)
+    sections = [a["id"] for tag, a in page.tags if tag == "h2"]
+    assert len(sections) == 8 and page.links[:8] == [f"#{name}" for name in sections]
+    assert len(set(page.ids)) == len(page.ids)
+    assert {link.removeprefix("#") for link in page.links} <= set(page.ids)
+
+
 def test_nothing_comes_from_outside(html):
     page = Page(html)
-    assert "://" not in re.sub(r"base64,[\w+/=]+", "", html)
+    assert "://" not in html and "@import" not in html
     assert not {tag for tag, _ in page.tags} & {"script", "link", "iframe", "object", "base"}
-    assert "@import" not in html and "url(" not in html
-    assert all(a.get("src", "data:").startswith("data:") and "href" not in a for _, a in page.tags)
+    assert not any("src" in a for _, a in page.tags)
+    assert all(link.startswith("#") for link in page.links)
+    assert html.count("url(") == html.count("url(#")
+
+
+def test_figures_are_drawn_in_the_pages_colours(html):
+    """So that dark paper changes them: no colour is left that is not a variable of the page."""
+    drawn = html[html.index("</style>") :]
+    assert not re.findall(r'style="[^"]*#[0-9a-f]{3,6}', drawn)
+    used = set(re.findall(r"var\(--([\w-]+)\)", html))
+    assert {"ink", "ik", "policy", "sea-3", "paper"} <= used <= set(palette.COLOURS)
+    for k in (0, 1):
+        assert f"--ik:{palette.COLOURS['ik'][k]};" in html
 
 
 def test_table_has_evaluates_numbers(made, html):
@@ -137,7 +162,8 @@ def test_table_has_evaluates_numbers(made, html):
         for unit in ("pos_mm", "ang_mrad"):
             assert f"{row[unit]['mean']:.2f} ± {row[unit]['std']:.2f}" in cells
     for group in ("all", "top5", "top1", "max"):
-        assert f"{100 * both[1][0]['improvement']['pos'][group]:.0f}" in cells
+        assert f"{round(100 * both[1][0]['improvement']['pos'][group])}" in cells
+    assert "-0" not in cells
 
 
 def test_the_papers_figures_stand_in_its_own_world_only(made, html):
@@ -364,31 +390,98 @@ def test_labels_moved_apart(places, moved):
     assert style.spread(places, 0.2) == pytest.approx(moved)
 
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+HOSTILE = ("a$x^$b <i>&amp; #123456", 'style="fill:#123456" 船{_', "x" * 300)
 
 
-@pytest.mark.parametrize("width_px", [500, 1200])
-def test_a_browser_shows_it(made, tmp_path, width_px):
-    """Chromium, if there is one: every image drawn, nothing wider than the window, no complaint."""
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if browser is None:
-        pytest.skip(f"no browser here (looked for {', '.join(BROWSERS)})")
-    probe = (
-        "<script>const root = document.documentElement;"
-        "addEventListener('load', () => { document.title = JSON.stringify({"
-        "images: [...document.images].filter(i => i.complete && i.naturalWidth > 0).length,"
-        "over: root.scrollWidth - root.clientWidth}) })</script></body>"
+@pytest.mark.parametrize("name", HOSTILE)
+def test_any_name_is_drawn_as_it_is(name):
+    """No markup of matplotlib's, XML's or HTML's is read in a name; a long one is shortened."""
+    assert len(style.short(name)) == min(len(name), style.LONGEST_NAME)
+    x, ik = np.arange(1.0, 4.0), palette.LIGHT["ik"]
+    curve = figures.Line(name, ik, x, x)
+    drawn = [
+        figures.boxes("", [("", [figures.box(name, ik, x)])], "x"),
+        figures.lines("", [curve], "x", "y", level=(name, ik, 2.0)),
+        figures.levels("", [curve], "x", "y"),
+        figures.follow(
+            style.short(name), x, [(name, ik, x), (name, ik, x), (name, ik, x)], "y", (1, 2, 1)
+        ),
+        figures.spectrum("", [(style.short(name), palette.SEAS[0], x / 4, x, x, x)], "y"),
+    ]
+    for figure in drawn:
+        assert style.png(figure).startswith(b"\x89PNG")
+        assert style.short(name) in Page(style.svg(figure, "x", name)).text
+    whole = Page(page(name, name, [name], [Section(name, [], name)], {name: name}))
+    assert whole.text.count(name) >= 7 and whole.open == []
+
+
+def test_names_that_are_no_text_are_escaped(tmp_path, monkeypatch):
+    monkeypatch.setattr(entries, "load_controller", lambda who: (who, None))
+    monkeypatch.setattr(entries, "policy_path", lambda who: None)
+    (one,) = entries.load_entries([os.fsdecode(b"run-\xff\n")])
+    assert one.label == r"run-\udcff\n"
+    page("a\udcff", "", [], [], {"command": "\udcff"}).encode()
+
+
+def test_every_controller_is_in_the_episodes_figures(monkeypatch):
+    x = np.linspace(0.0, 1.0, 90)
+    track = np.stack([np.sin(5 * x)] * 3, 1)
+    ik = Episode(track, track, track, x, x, np.zeros((90, 6)), np.ones((90, 1)))
+    monkeypatch.setattr(build, "record", lambda *_, **__: (ik, ik))
+    names = ["ik", "extrapolate", "fir", "run"]
+    made = [entries.Entry(n, n, None, {}, n == "run", None) for n in names]
+    env = SimpleNamespace(motion=SimpleNamespace(seas=("Wd",)), model=None)
+    monkeypatch.setattr(build, "torque_limits_nm", lambda model: np.array([100.0]))
+    config = SimpleNamespace(show=0, episodes=1, seed=0, env=TASK)
+    said = []
+    tracking, effort = build._episode_sections(
+        config, env, made, palette.controllers(names), said.append
     )
-    page = tmp_path / "page.html"
-    text = (made[0] / "index.html").read_text(encoding="utf-8")
-    page.write_text(text.replace("</body>", probe), encoding="utf-8")
-    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--window-size={width_px},900"]
-    options += [f"--user-data-dir={tmp_path / 'profile'}", "--enable-logging=stderr", "--dump-dom"]
-    done = subprocess.run(
-        [browser, *options, page.as_uri()], capture_output=True, text=True, timeout=120, check=False
-    )
-    if done.returncode:
-        pytest.skip(f"{browser} does not start here: {done.stderr[-300:]}")
-    shown = json.loads(re.search(r"<title>(.*?)</title>", done.stdout)[1])
-    assert shown == {"images": len(list(made[0].glob("*.png"))), "over": 0}
-    assert "CONSOLE" not in done.stderr, done.stderr
+    assert [p.name for p in tracking.panels[:4]] == [f"follow_{k}" for k in range(4)]
+    assert said == [f"recording one episode of {name}" for name in names[1:]]
+    curves = {p.name: Page(style.svg(p.figure, "x", "")).text for p in tracking.panels}
+    for name in names:
+        assert name in curves["episode_dp"] and name in tracking.caption
+
+
+def test_learning_curves_say_that_they_explore():
+    """The finished policy's error, without exploration, is on the figure beside ik's."""
+    x = np.array([1e6, 2e6])
+    curves = entries.Curves(x, x / 1e5, np.array([[9.0, 6.0]]), np.array([[3.0, 2.0]]))
+    colours = palette.controllers(["ik", "run"])
+    final = {"ik": {"pos_mm": 5.0, "ang_mrad": 4.0}, "run": {"pos_mm": 1.0, "ang_mrad": 0.5}}
+    section = sections.learning([("run", curves)], colours, final)
+    assert "noise of exploration in every action" in section.caption
+    axes = section.panels[0].figure.axes[0]
+    assert "exploring" in axes.get_title(loc="left")
+    marks = [line for line in axes.lines if line.get_marker() == "D"]
+    assert [tuple(np.ravel(m.get_xydata())) for m in marks] == [(2.0, 1.0)]
+    without = sections.learning([("run", curves)], colours, {})
+    assert "iamond" not in without.caption and len(without.panels[0].figure.axes[0].lines) == 1
+
+
+@pytest.mark.parametrize(("width_px", "dark"), [(1280, False), (390, True)])
+def test_a_browser_shows_it(made, tmp_path, width_px, dark):
+    """Every figure drawn, nothing cut off or wider than the window, no complaint, contents work."""
+    with browser.tab(tmp_path / "profile", width_px, dark=dark) as tab:
+        tab.page.goto((made[0] / "index.html").as_uri())
+        assert tab.sideways_px() <= 0 and tab.cut_off() == []
+        picture = tab.picture()
+        paper = palette.COLOURS["paper"][dark]
+        assert tuple(picture[-1, -1]) == tuple(bytes.fromhex(paper[1:]))
+        assert not browser.blank(picture)
+        sizes = "all => all.map(e => e.getBoundingClientRect().height)"
+        heights = tab.page.locator("svg").evaluate_all(sizes)
+        assert len(heights) == len(list(made[0].glob("*.png"))) and min(heights) > 100
+        for link in tab.page.locator("nav a").all():
+            link.click()
+            target = tab.page.locator(link.get_attribute("href"))
+            assert target.inner_text() == link.inner_text()
+            tab.page.wait_for_function(IN_SIGHT, arg=link.get_attribute("href"))
+    assert tab.complaints == []
+
+
+IN_SIGHT = """id => {
+  const { top, bottom } = document.querySelector(id).getBoundingClientRect()
+  return top >= 0 && bottom <= innerHeight
+}"""

@@ -3,13 +3,15 @@
 from pathlib import Path
 from typing import Any
 
+from mcx_jax.palette import ENGINES, LIGHT
+
 STYLES = {
-    "chain": ("mcx_jax chain engine", "#0b6e4f", "o", 0),
-    "c-batch": ("C MuJoCo, mujoco.batch", "#c8553d", "s", 4),
-    "c-rollout": ("C MuJoCo, mujoco.rollout", "#b9770e", "^", -6),
-    "mjx": ("MuJoCo MJX", "#4a6fa5", "D", 0),
+    "chain": ("mcx_jax chain engine", "o", 0),
+    "c-batch": ("C MuJoCo, mujoco.batch", "s", 4),
+    "c-rollout": ("C MuJoCo, mujoco.rollout", "^", -6),
+    "mjx": ("MuJoCo MJX", "D", 0),
 }
-"""Label, colour, marker, and how far up the label is moved (points; the C engines lie close)."""
+"""Label, marker, and how far up the label is moved (points; the C engines lie close)."""
 
 
 def draw(figures: dict[str, Any], path: Path) -> None:
@@ -18,7 +20,8 @@ def draw(figures: dict[str, Any], path: Path) -> None:
 
     figure = Figure(figsize=(8, 4.6), layout="constrained")
     axes = figure.subplots()
-    for engine, (label, colour, marker, lift) in STYLES.items():
+    for engine, (label, marker, lift) in STYLES.items():
+        colour = LIGHT[ENGINES[engine]]
         rows = [row for row in figures["physics"] if row["engine"] == engine]
         envs, speed = [r["envs"] for r in rows], [r["steps_per_s"] for r in rows]
         axes.loglog(envs, speed, color=colour, marker=marker, ms=5, lw=1.8)

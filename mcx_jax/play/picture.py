@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from mcx_jax import palette
 from mcx_jax.play.episode import Take
 from mcx_jax.play.stage import Painter, Stage
 from mcx_jax.play.waves import Surface
@@ -14,9 +15,7 @@ TITLE_PX, PANEL_PX, GAP_PX = 46, 430, 4
 CLOSE_UP_PX = 168
 PLOT_BOX_PX = (54, 508, 1256, 688)
 """Left, top, right, bottom of the axes."""
-INK, MUTED, GRID, PAPER = "#1f2328", "#5f6670", "#e3e6ea", "#ffffff"
-COLOURS = ("#d1480b", "#0072b2")
-"""Of `ik` and of the other."""
+INK, MUTED, GRID, PAPER = (palette.LIGHT[name] for name in ("ink", "muted", "grid", "paper"))
 TICKS_MM = (0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200)
 """Distances of grid lines to choose from."""
 
@@ -32,6 +31,7 @@ class Picture:
         """
         self._take, self._surface, self._stage, self._painter = take, surface, stage, painter
         self._title = title
+        self._colours = list(palette.controllers(take.names).values())
         # Round numbers; a diverged episode must not flatten the rest.
         highest = max(np.nanquantile(1e3 * p.pos_error_m, 0.995) for p in take.poses)
         self._tick_mm = next((t for t in TICKS_MM if highest <= 4.5 * t), TICKS_MM[-1])
@@ -65,7 +65,7 @@ class Picture:
         label = "IK baseline" if name == "ik" else name
         camera = "hero" if len(self._take.names) == 1 else "pair"
         errors = poses.pos_error_m[step], poses.ang_error_rad[step]
-        return panel(self._painter, (width, PANEL_PX), camera, (label, COLOURS[i]), errors)
+        return panel(self._painter, (width, PANEL_PX), camera, (label, self._colours[i]), errors)
 
     def _plot(self, draw: ImageDraw.ImageDraw, step: int) -> None:
         left, top, right, bottom = PLOT_BOX_PX
@@ -86,9 +86,9 @@ class Picture:
             y = bottom - up * np.clip(mm, 0, self._top_mm)
             line = list(zip(left + across * time_s[: step + 1], y, strict=True))
             if len(line) > 1:
-                draw.line(line, COLOURS[i], 3, joint="curve")
+                draw.line(line, self._colours[i], 3, joint="curve")
             x, y = line[-1]
-            draw.ellipse((x - 5, y - 5, x + 5, y + 5), fill=COLOURS[i])
+            draw.ellipse((x - 5, y - 5, x + 5, y + 5), fill=self._colours[i])
 
 
 def panel(

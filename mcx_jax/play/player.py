@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import viser
 
+from mcx_jax import palette
 from mcx_jax.controllers import CLASSICAL
 from mcx_jax.delay import CONTROL_DT_S, NAMED_DELAYS
 from mcx_jax.envs.v2v import V2VEnv, make_env
@@ -23,8 +24,6 @@ STRIDE = 2
 """Control steps from one picture to the next: 25 a second."""
 PLOT_EVERY = 5
 """Pictures from one update of the plot to the next."""
-COLOURS = ("#d1480b", "#0072b2")
-"""Of `ik` and of the other."""
 
 
 @dataclass(frozen=True)
@@ -182,7 +181,7 @@ class Player:
         if self._plot is not None:
             self._plot.remove()
         series: list[Any] = [{"label": "s"}]
-        for name, colour in zip(take.names, COLOURS, strict=False):
+        for name, colour in palette.controllers(take.names).items():
             series.append({"label": f"{name}, mm", "stroke": colour, "width": 2})
         top_mm = 1.1 * max(np.nanquantile(1e3 * p.pos_error_m, 0.999) for p in take.poses)
         self._plot = self.server.gui.add_uplot(

@@ -14,6 +14,7 @@ from mcx_jax import machine
 from mcx_jax.delay import CONTROL_DT_S
 from mcx_jax.envs.model import torque_limits_nm
 from mcx_jax.evaluate import Errors, errors_beside_ik, evaluation_env, rows_beside_ik
+from mcx_jax.palette import controllers
 from mcx_jax.paper import is_papers_world, table3
 from mcx_jax.report import sections, style
 from mcx_jax.report.entries import Entry, learning_curves
@@ -25,6 +26,7 @@ from mcx_jax.report.spectra import motion_spectra
 from mcx_jax.report.table import table
 from mcx_jax.roster import fit_if_needed
 
+UNITS = ("pos_mm", "ang_mrad")
 Rows = dict[str, list[dict[str, Any]]]
 
 
@@ -44,14 +46,13 @@ def build(
         for e in entries
     ]
     errors, rows = _evaluate(config, env, entries, say)
-    colours = style.colours([entry.label for entry in entries])
-    shown = [e for e in entries if e.learned] or list(entries[1:])[-1:]
+    colours = controllers([entry.label for entry in entries])
     parts = [(e.label, e.learned, errors[e.label]) for e in entries]
     ideal = is_papers_world(config.env, config.motion)
     chapters = [
         sections.distributions(parts, ideal),
         _table_section(rows, ideal),
-        *_episode_sections(config, env, entries[0], shown, colours, say),
+        *_episode_sections(config, env, entries, colours, say),
         *_learning_sections(config, entries, rows, colours),
         sections.sea_spectra(
             motion_spectra(
@@ -71,7 +72,6 @@ def build(
         f"{names}: {config.episodes} test episodes a sea. {config.env.describe_delays()}.",
         sections.lead(rows, [e.label for e in entries if e.learned]),
         chapters,
-        pngs,
         facts := _facts(config, entries, argv),
     )
     every = [row for part in rows.values() for row in part]
@@ -105,8 +105,8 @@ def _table_section(rows: Rows, papers_world: bool) -> Section:
     return Section(
         "Table 3, ours and the paper's" if beside else "Means and improvements",
         [],
-        "Mean and standard deviation over all points, and how far the mean of all points, of the "
-        "worst 5 % and 1 %, and the maximum lie below ik's. "
+        "Mean and standard deviation over all points, and by how much the mean of all points, of "
+        "the worst 5 % and 1 % of them, and the maximum (max) lie below ik's. "
         + (
             "In italics the paper's figures (Herland & Bach, AAAI 2023, table 3), where it has "
             "this delay and sea; its ik is what its agents' errors and improvements imply. "
@@ -122,10 +122,10 @@ def _table_section(rows: Rows, papers_world: bool) -> Section:
     )
 
 
-def _episode_sections(config, env, ik: Entry, shown, colours, say) -> list[Section]:
+def _episode_sections(config, env, entries: Sequence[Entry], colours, say) -> list[Section]:
     sea = len(env.motion.seas) - 1
     recorded = []
-    for entry in shown or [ik]:
+    for entry in entries[1:] or entries:
         say(f"recording one episode of {entry.label}")
         both = record(
             env,
@@ -137,7 +137,7 @@ def _episode_sections(config, env, ik: Entry, shown, colours, say) -> list[Secti
         )
         recorded.append((entry.label, *both))
     baseline = recorded[0][1]
-    others = [(label, ours) for label, _, ours in recorded if label != ik.label]
+    others = [(label, ours) for label, _, ours in recorded if label != "ik"]
     seconds = config.env.episode_steps * CONTROL_DT_S
     where = f"Test episode {config.show} of sea {env.motion.seas[sea]}, {seconds:g} s"
     return [
@@ -171,11 +171,11 @@ def _learning_sections(config, entries: Sequence[Entry], rows: Rows, colours) ->
             same &= all(getattr(config.env, k) == v for k, v in entry.settings.items())
     if not runs:
         return []
-    ik = {
-        name: float(np.mean([row[unit]["mean"] for row in rows["ik"]]))
-        for name, unit in (("dp", "pos_mm"), ("da", "ang_mrad"))
+    final = {
+        label: {unit: float(np.mean([row[unit]["mean"] for row in rows[label]])) for unit in UNITS}
+        for label in ("ik", *(label for label, _ in runs))
     }
-    return [sections.learning(runs, colours, ik if same else {})]
+    return [sections.learning(runs, colours, final if same else {})]
 
 
 def _facts(config, entries: Sequence[Entry], argv: Sequence[str]) -> dict[str, str]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mcx_jax import cli
-from mcx_jax.errors import UserError
+from mcx_jax.errors import UserError, printable
 from mcx_jax.roster import load_controller, policy_path
 from mcx_jax.run_dir import METRICS, whole_rows
 
@@ -64,13 +64,13 @@ def check_names(runs: Sequence[str]) -> tuple[str, ...]:
 
 
 def load_entries(runs: Sequence[str]) -> list[Entry]:
-    """Controllers for the names of `check_names`."""
+    """Controllers for the names of `check_names`; labels can be printed."""
     entries = [_load(who) for who in runs]
     for shorten in (_without_delay, _name):
-        labels = [shorten(entry) for entry in entries]
+        labels = [printable(shorten(entry)) for entry in entries]
         if len(set(labels)) == len(labels):
             return [replace(e, label=label) for e, label in zip(entries, labels, strict=True)]
-    return entries
+    return [replace(e, label=printable(e.who)) for e in entries]
 
 
 def _load(who: str) -> Entry:

@@ -65,7 +65,7 @@ def boxes(
             _draw_box(axes, y, entry)
             ticks.append((y, entry))
         y += 1.0
-    axes.set_yticks([y for y, _ in ticks], [b.label for _, b in ticks], fontsize=8.5)
+    axes.set_yticks([y for y, _ in ticks], [style.short(b.label) for _, b in ticks], fontsize=8.5)
     for text, (_, b) in zip(axes.get_yticklabels(), ticks, strict=True):
         text.set_color(b.colour)
     axes.set_ylim(y - 0.4, -0.7)
@@ -81,7 +81,7 @@ def boxes(
 
 def _heading(axes: Axes, y: float, text: str) -> None:
     place = axes.get_yaxis_transform()
-    box = {"facecolor": "white", "edgecolor": "none", "pad": 1.5}  # over the grid
+    box = {"facecolor": style.PAPER, "edgecolor": "none", "pad": 1.5}  # over the grid
     axes.text(*(0.012, y, text), transform=place, va="center", weight="bold", fontsize=9, bbox=box)
 
 
@@ -89,7 +89,7 @@ def _draw_box(axes: Axes, y: float, b: Box) -> None:
     q = b.quantiles
     axes.hlines(y, q[0], q[4], color=b.colour, lw=1.1)
     axes.barh(
-        y, q[3] - q[1], left=q[1], height=0.62, color=_pale(b.colour), edgecolor=b.colour, lw=1.1
+        y, q[3] - q[1], left=q[1], height=0.62, color=(b.colour, 0.3), edgecolor=b.colour, lw=1.1
     )
     axes.vlines(q[2], y - 0.31, y + 0.31, color=b.colour, lw=1.8)
     axes.plot(b.mean, y, "o", ms=3.6, color=b.colour)
@@ -104,11 +104,6 @@ def _short(value: float) -> str:
     return f"{value:.2f}" if value < 10 else f"{value:.1f}" if value < 100 else f"{value:.0f}"
 
 
-def _pale(colour: str) -> tuple[float, ...]:
-    rgb = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
-    return tuple(1 - 0.3 * (1 - c) for c in rgb)
-
-
 def _plain_log(axis) -> None:
     """0.1, 1, 10 instead of powers, and steps between them where there are few."""
     low, high = axis.get_view_interval()
@@ -117,6 +112,12 @@ def _plain_log(axis) -> None:
     axis.get_major_locator().set_params(subs=subs)
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
+
+
+def _power(value: float, _: int) -> str:
+    """10⁻³, without the markup that matplotlib would write it in."""
+    exponent = round(np.log10(value))
+    return "10" + str(exponent).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
 
 
 @style.styled
@@ -128,11 +129,13 @@ def lines(
     *,
     log: bool = False,
     level: tuple[str, str, float] | None = None,
+    ends: Sequence[tuple[str, float]] = (),
 ) -> Figure:
     """Curves against x, each named at its right end.
 
     Args:
         level: (text, colour, y) of a dashed horizontal line.
+        ends: (colour, y) of open diamonds at the right edge.
     """
     figure, axes = style.panel(title)
     axes.set_xlabel(xlabel)
@@ -149,9 +152,14 @@ def lines(
     if level is not None:
         axes.axhline(level[2], color=level[1], lw=1.2, ls=(0, (5, 3)))
         labels.append(level)
-    axes.set_xlim(0.0, max(c.x[-1] for c in curves))
+    end = max(c.x[-1] for c in curves)
+    for colour, y in ends:
+        axes.plot(end, y, "D", ms=6, mfc="none", mec=colour, mew=1.4, clip_on=False)
+    axes.set_xlim(0.0, end)
     axes.xaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
     if log:
+        # An error passes through zero now and then: such spikes say nothing.
+        axes.set_ylim(bottom=0.7 * min(np.nanquantile(c.y, 0.02) for c in curves))
         _plain_log(axes.yaxis)
     else:
         axes.set_ylim(bottom=0.0)
@@ -195,7 +203,7 @@ def follow(
     """
     figure, axes = style.panel(title)
     goal, reference, tool = tracks
-    axes.plot(time_s, goal[2], color=style.GOAL_BAND, lw=5)
+    axes.plot(time_s, goal[2], color=style.GOAL, lw=5)
     axes.plot(time_s, reference[2], color=reference[1], lw=1.2, ls=(0, (2, 1.5)))
     axes.plot(time_s, tool[2], color=tool[1], lw=1.9)
     axes.set_xlabel("time, s")
@@ -257,6 +265,7 @@ def spectrum(
     axes.set_xlabel("frequency, Hz (laboratory)")
     axes.set_ylabel(ylabel)
     _plain_log(axes.xaxis)
+    axes.yaxis.set_major_formatter(FuncFormatter(_power))
     if seas[0][4].size:
         axes.text(0.98, 0.96, "dashed: target", transform=axes.transAxes, ha="right", va="top")
     return figure

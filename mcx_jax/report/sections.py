@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from mcx_jax import palette
 from mcx_jax.evaluate import Errors
 from mcx_jax.report import figures, style
 from mcx_jax.report.entries import Curves
@@ -49,7 +50,7 @@ def distributions(parts: Sequence[tuple[str, bool, Errors]], papers_world: bool)
         parts: (label, learned, errors) each.
         papers_world: the paper's means belong beside them.
     """
-    colours = style.colours([label for label, _, _ in parts])
+    colours = palette.controllers([label for label, _, _ in parts])
     panels, diamonds = [], False
     for k, (name, unit) in enumerate((("dp", "mm"), ("da", "mrad"))):
         groups = []
@@ -94,7 +95,8 @@ def tracking(
         lag = 1e3 * lag_s(e.goal_m[warm], e.tool_m[warm])
         late = f"{abs(lag):.0f} ms {'late' if lag >= 0 else 'early'}"
         lags.append(f"{label} {late if np.isfinite(lag) else 'diverged'}")
-        title = f"{label}: " + (f"tool {late} on average" if np.isfinite(lag) else "diverged")
+        title = f"{style.short(label)}: "
+        title += f"tool {late} on average" if np.isfinite(lag) else "diverged"
         panels.append(
             Panel(
                 f"follow_{len(panels)}",
@@ -109,7 +111,7 @@ def tracking(
         curves = [Line("ik", colours["ik"], ik.time_s, values(ik))]
         curves += [Line(label, colours[label], e.time_s, values(e)) for label, e in others]
         title = "Position error" if name == "dp" else "Orientation error"
-        drawn = figures.lines(title, curves, "time, s", f"{name}, {unit}")
+        drawn = figures.lines(title, curves, "time, s", f"{name}, {unit} (logarithmic)", log=True)
         panels.append(Panel(f"episode_{name}", f"{name} over one episode", drawn))
     return Section(
         "One episode",
@@ -166,7 +168,7 @@ def _follow(title: str, e: Episode, axis: int, window: slice, colour: str) -> Fi
     return figures.follow(
         title,
         time_s,
-        [("goal", style.GOAL, goal), ("reference", colour, reference), ("tool", colour, tool)],
+        [("goal", style.MUTED, goal), ("reference", colour, reference), ("tool", colour, tool)],
         f"{'xyz'[axis]} in the arm base's frame, mm",
         (late[0], late[1], level),
     )
@@ -218,54 +220,65 @@ def effort(
 
 
 def learning(
-    runs: Sequence[tuple[str, Curves]], colours: dict[str, str], ik: dict[str, float]
+    runs: Sequence[tuple[str, Curves]],
+    colours: dict[str, str],
+    final: dict[str, dict[str, float]],
 ) -> Section:
     """Learning curves of the runs that have metrics.
 
     Args:
-        ik: the baseline's mean over the seas evaluated, `dp` in mm and `da` in mrad; {} if the
-            runs were trained for another task.
+        final: `ik` and every run -> its mean on the test motion over the seas evaluated, `pos_mm`
+            and `ang_mrad`; {} if the runs were trained for another task.
     """
     panels = []
     for name, unit, field in (("dp", "mm", "pos_mm"), ("da", "mrad", "ang_mrad")):
+        level = ("ik", colours["ik"], final["ik"][field]) if final else None
+        ends = [(colours[label], final[label][field]) for label, _ in runs if final]
         for against in ("steps", "wall"):
-            curves = []
-            for label, c in runs:
-                y = getattr(c, field)
-                x = 1e-6 * c.steps if against == "steps" else c.wall_s / 60.0
-                band = (y.min(axis=0), y.max(axis=0)) if len(y) > 1 else None
-                curves.append(Line(label, colours[label], x, y.mean(axis=0), band))
+            curves = [_learning_curve(label, c, field, against, colours) for label, c in runs]
             xlabel = "control steps, millions" if against == "steps" else "training time, minutes"
             title = "Position error" if name == "dp" else "Orientation error"
-            level = ("ik", colours["ik"], ik[name]) if ik else None
             drawn = figures.lines(
-                f"{title} while learning",
+                f"{title} in training, exploring",
                 curves,
                 xlabel,
                 f"mean {name}, {unit} (logarithmic)",
                 log=True,
                 level=level,
+                ends=ends,
             )
             panels.append(Panel(f"learning_{name}_{against}", f"Mean {name} by {xlabel}", drawn))
     several = [f"{label} ({len(c.pos_mm)} seeds)" for label, c in runs if len(c.pos_mm) > 1]
     return Section(
         "Learning curves",
         panels,
-        "Mean error of the experience of each iteration, on training motion and with the noise of "
-        "exploration where the algorithm has one, so above what the table says of the finished "
-        "policy. "
+        "Mean error of the experience of each iteration: on training motion and, where the "
+        "algorithm explores, with the noise of exploration in every action. A curve may so end "
+        "above ik while the policy that came of it, which acts without that noise, is far below. "
         + (
-            f"Line and band: mean and range over the seeds of {', '.join(several)}. "
-            if several
-            else "One seed a run: no interval can be given. "
+            "Diamonds at the right edge: the finished policies, on the test motion, mean over the "
+            "seas; dashed: ik, the same. "
+            if final
+            else ""
         )
-        + ("Dashed: ik on the test motion, mean over the seas." if ik else ""),
+        + (
+            f"Line and band: mean and range over the seeds of {', '.join(several)}."
+            if several
+            else "One seed a run: no interval can be given."
+        ),
     )
+
+
+def _learning_curve(label: str, c: Curves, field: str, against: str, colours: dict) -> Line:
+    y = getattr(c, field)
+    x = 1e-6 * c.steps if against == "steps" else c.wall_s / 60.0
+    band = (y.min(axis=0), y.max(axis=0)) if len(y) > 1 else None
+    return Line(label, colours[label], x, y.mean(axis=0), band)
 
 
 def sea_spectra(spectra: Sequence[Spectrum]) -> Section:
     """Spectra of the six motions, measured and wanted."""
-    shades = style.SEAS if len(spectra) == len(style.SEAS) else style.SEAS[2:3] * len(spectra)
+    shades = palette.SEAS if len(spectra) == len(palette.SEAS) else palette.SEAS[2:3] * len(spectra)
     panels = []
     for k, (channel, unit) in enumerate(zip(CHANNELS, UNITS, strict=True)):
         seas = [

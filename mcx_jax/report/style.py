@@ -6,25 +6,25 @@ below the other on a phone, where their letters stay readable.
 
 import functools
 import io
+import re
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from mcx_jax.palette import COLOURS, LIGHT
+
 WIDTH_IN = 4.8
 DPI = 200
+LONGEST_NAME = 26
+"""Characters, at the right of a figure: more leave too little room for the curves."""
 
-INK, MUTED, GRID = "#1f2328", "#5f6670", "#e3e6ea"
-GOAL, GOAL_BAND = "#7d5f00", "#f2cc5c"
-"""The goal's letters, and the broad line that the tool should stay on."""
-NAMED = {"ik": "#5f6670", "extrapolate": "#a6611a", "preview": "#018571"}
-RUNS = ("#0072b2", "#d1480b", "#882255", "#117733", "#332288", "#aa4499")
-"""Of Okabe & Ito's and Tol's sets, those that are dark enough for letters on white."""
-SEAS = ("#7fb2d9", "#3f8cc4", "#1a5f9c", "#0b2f5c")
-"""Calm to rough: one hue that darkens, so that the order shows without colour as well."""
+INK, MUTED, GRID, PAPER, GOAL = (LIGHT[n] for n in ("ink", "muted", "grid", "paper", "goal"))
 
 _RC: dict[Any, Any] = {
     "font.size": 9.5,
@@ -46,7 +46,9 @@ _RC: dict[Any, Any] = {
     "ytick.labelcolor": INK,
     "text.color": INK,
     "lines.linewidth": 1.5,
-    "savefig.facecolor": "white",
+    "savefig.facecolor": PAPER,
+    "text.parse_math": False,  # names are shown as they are, dollar signs and all
+    "svg.fonttype": "none",
 }
 
 
@@ -70,16 +72,72 @@ def panel(title: str, height_in: float = 3.1) -> tuple[Figure, Axes]:
 
 
 def png(figure: Figure) -> bytes:
-    """The figure as a PNG file."""
+    """The figure as a PNG file, on light paper."""
+    return _saved(figure, format="png", dpi=DPI)
+
+
+def svg(figure: Figure, name: str, alt: str) -> str:
+    """The figure as an SVG element of the page: its text is text, in the page's letters, and its
+    colours are the page's variables (`css_colours`).
+
+    Args:
+        name: unique on the page.
+        alt: what it shows, for who cannot see it.
+    """
+    nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
+    with rc_context({"svg.hashsalt": name}):
+        root = ElementTree.fromstring(
+            _saved(figure, format="svg", transparent=True, metadata=nothing)
+        )
+    for element in root.iter():
+        element.tag = _bare(element.tag)
+        element.attrib = {_bare(k): _restyled(k, v) for k, v in element.attrib.items()}
+        for child in [c for c in element if _bare(c.tag) == "defs" and _bare(c[0].tag) == "style"]:
+            element.remove(child)  # it would hold for the whole page, which says the same
+        if element.tag == "g":
+            element.attrib.pop("id", None)  # the same in every figure
+    root.attrib = {"viewBox": root.attrib["viewBox"], "role": "img", "aria-label": alt}
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def _bare(name: str) -> str:
+    """Without the namespace, which HTML does not have."""
+    return name.rpartition("}")[2]
+
+
+def _restyled(attribute: str, value: str) -> str:
+    if attribute != "style":
+        return value
+    inherited = re.sub(r"font-family: [^;]*(; |$)", "", value)
+    return re.sub(r"#[0-9a-f]{6}\b", lambda match: f"var(--{_NAMES[match[0]]})", inherited)
+
+
+_NAMES = {colour: name for name, colour in LIGHT.items()}
+
+
+def css_colours() -> str:
+    """The palette as variables of the page, for light and for dark paper."""
+    light, dark = (
+        "".join(f"--{name}:{pair[k]};" for name, pair in COLOURS.items()) for k in (0, 1)
+    )
+    return (
+        f":root{{color-scheme:light dark;{light}}}\n"
+        f"@media screen and (prefers-color-scheme:dark){{:root{{{dark}}}}}\n"
+    )
+
+
+def _saved(figure: Figure, **options: Any) -> bytes:
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI)
+    with rc_context(_RC), warnings.catch_warnings():
+        # In a name of letters that matplotlib's font lacks: a box in the PNG, nothing to do about.
+        warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)
+        figure.savefig(buffer, **options)
     return buffer.getvalue()
 
 
-def colours(labels: Sequence[str]) -> dict[str, str]:
-    """A colour for each controller; the same for the named ones in every report."""
-    runs = [label for label in labels if label not in NAMED]
-    return {label: NAMED.get(label) or RUNS[runs.index(label) % len(RUNS)] for label in labels}
+def short(name: str) -> str:
+    """A name as figures have room for it: of a long one the middle goes."""
+    return name if len(name) <= LONGEST_NAME else f"{name[:14]}…{name[14 + 1 - LONGEST_NAME :]}"
 
 
 def label_right(
@@ -96,7 +154,7 @@ def label_right(
     places = spread(at, 1.15 * size / height_pt)
     for (text, colour, _), place in zip(labels, places, strict=True):
         axes.annotate(
-            *(text, (1.0, place)),
+            *(short(text), (1.0, place)),
             xycoords="axes fraction",
             xytext=(4, 0),
             textcoords="offset points",
