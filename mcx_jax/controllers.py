@@ -111,7 +111,8 @@ def moved(pose: tuple[Mat, Vec], change: Sequence[Scalar], wall: jax.Array | Non
 
     Args:
         wall: see `mcx_jax.stage`. Without walls XLA computed a controller's rotations again for
-            every number of its action: a control step of `extrapolate` took 28 times a policy's.
+            every number of its action: a control step of `extrapolate` took 195 us instead of 3
+            (256 episodes at once).
     """
     turn = stage(wall, exp_rotation, tuple(change[3:]))
     return stage(wall, matmul, turn, pose[0]), vadd(pose[1], tuple(change[:3]))  # type: ignore[arg-type]

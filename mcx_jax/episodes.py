@@ -23,7 +23,8 @@ def run_episodes(env, controller, keys, seas, gain, given=None):
 
     Returns:
         dp (steps, N) m, da (steps, N) rad, valid (N,) bool, correction (steps, 6, N) in cm and
-        crad, and the largest share of its torque limit that a joint uses, (steps, N).
+        crad, the largest share of its torque limit that a joint uses, (steps, N), and whether the
+        goal was out of reach and a joint asked to be too fast (`V2VEnv.strain`), (steps, 2, N).
     """
     reset = jax.vmap(env.reset, in_axes=(0, 0, None if given is None else -1), out_axes=-1)
     step = jax.vmap(env.step, in_axes=-1, out_axes=-1)
@@ -38,13 +39,15 @@ def run_episodes(env, controller, keys, seas, gain, given=None):
         after = step(state, action)
         share = jnp.max(jnp.abs(torques(state, after)) / limits, axis=0)
         errors = after.metrics.pos_error_m, after.metrics.ang_error_rad
-        return (after, memory), (*errors, action, share)
+        strain = jnp.stack(strained(state, after))
+        return (after, memory), (*errors, action, share, strain)
 
     limits = torque_limits_nm(env.model)[:, None]
     torques = jax.vmap(env.joint_torques, in_axes=-1, out_axes=-1)
+    strained = jax.vmap(env.strain, in_axes=-1, out_axes=-1)
     (state, _), series = jax.lax.scan(body, (state, memory), None, env.episode_steps)
-    dp, da, action, share = series
-    return dp, da, state.metrics.valid, action, share
+    dp, da, action, share, strain = series
+    return dp, da, state.metrics.valid, action, share, strain
 
 
 @functools.cache
@@ -60,8 +63,8 @@ def episode_errors(env, controller, gains: tuple[float, ...], episodes: int, see
     a difference is the controller's or the sea's alone.
 
     Returns:
-        dp m, da rad, valid, correction cm and crad, torque share as `run_episodes` returns them,
-        with (gains, seas, episodes) for N.
+        dp m, da rad, valid, correction cm and crad, torque share, strain as `run_episodes` returns
+        them, with (gains, seas, episodes) for N.
     """
     shape = (len(gains), len(env.motion.seas), episodes)
     keys = jnp.tile(jax.random.split(jax.random.key(seed), episodes), shape[0] * shape[1])

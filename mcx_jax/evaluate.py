@@ -70,14 +70,17 @@ class Errors:
     """(steps, 6, seas, episodes) cm and crad."""
     torque_share: Any
     """(steps, seas, episodes), 1 = at the limit."""
+    strain: Any
+    """(steps, 2, seas, episodes) bool: goal out of reach, a joint too fast."""
 
     def rows(self) -> list[dict[str, Any]]:
         """One result row a sea (without the improvement)."""
-        from mcx_jax.results import effort, row
+        from mcx_jax.results import effort, row, strain
 
         return [
             row(self.who, self.delay, sea, self.pos_m[:, i], self.ang_rad[:, i], self.valid[i])
             | effort(self.correction[:, :, i], self.torque_share[:, i])
+            | strain(self.strain[:, :, i])
             for i, sea in enumerate(self.seas)
         ]
 
@@ -119,7 +122,9 @@ def errors_beside_ik(
     gains = (0.0, 1.0)[: len(names)]
     count = len(names) * len(env.motion.seas) * episodes
     say(f"compiling (up to 2 min the first time) and running {count} episodes")
-    dp, da, valid, correction, share = episode_errors(env, controller, gains, episodes, seed)
+    dp, da, valid, correction, share, strain = episode_errors(
+        env, controller, gains, episodes, seed
+    )
     return [
         Errors(
             who=name,
@@ -130,6 +135,7 @@ def errors_beside_ik(
             valid=valid[k],
             correction=correction[:, :, k],
             torque_share=share[:, k],
+            strain=strain[:, :, k],
         )
         for k, name in enumerate(names)
     ]

@@ -141,9 +141,25 @@ def _table(rows: list[Row], names: tuple, numbers: tuple) -> Any:
     return terminal.table([column.head for column in shown], cells, texts=len(names))
 
 
+def _strains(rows: list[Row]) -> list[str]:
+    """Where the arm was asked for what it cannot do: a line a controller and sea."""
+    said = []
+    for r in rows:
+        found = r["strain"]
+        share = lambda name: f"in {found[name]} of {found['steps']} control steps"  # noqa: B023, E731
+        parts = []
+        if found["out_of_reach"]:
+            parts.append(f"the corrected goal out of the arm's reach {share('out_of_reach')}")
+        if found["too_fast"]:
+            parts.append(f"a joint asked to be faster than its servo takes {share('too_fast')}")
+        if parts:
+            said.append(f"{r['who']}, {r['sea']}: {'; '.join(parts)}")
+    return said
+
+
 def _notes(rows: list[Row], env: EnvConfig, beside: bool) -> list[str]:
     """What the numbers mean and how far they hold."""
-    notes = [EFFORT_NOTE]
+    notes = [EFFORT_NOTE, *_strains(rows)]
     if beside:
         notes.append(PAPER_NOTE)
     if env.integrator != "quiet":

@@ -133,6 +133,22 @@ def effort(correction: np.ndarray, torque_share: np.ndarray) -> dict[str, Any]:
     }
 
 
+def strain(found: np.ndarray) -> dict[str, Any]:
+    """How many control steps after the warm-up asked the arm for what it cannot do.
+
+    Args:
+        found: (steps, 2, episodes) bool: goal out of reach, a joint too fast.
+    """
+    out_of_reach, too_fast = found[WARM_UP_STEPS:].sum(axis=(0, 2))
+    return {
+        "strain": {
+            "steps": int(found[WARM_UP_STEPS:, 0].size),
+            "out_of_reach": int(out_of_reach),
+            "too_fast": int(too_fast),
+        }
+    }
+
+
 def finite_episodes(pos_m: np.ndarray, ang_rad: np.ndarray) -> np.ndarray:
     """(episodes,) bool: which of (steps, episodes) have no number that is not finite."""
     return np.asarray(np.isfinite(pos_m).all(axis=0) & np.isfinite(ang_rad).all(axis=0))

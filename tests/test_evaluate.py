@@ -13,7 +13,7 @@ from mcx_jax.controllers import CLASSICAL
 from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.errors import UserError
 from mcx_jax.evaluate import EvaluateConfig, evaluate
-from mcx_jax.results import GROUPS
+from mcx_jax.results import GROUPS, WARM_UP_STEPS
 from mcx_jax.roster import load_controller
 
 # 20 steps count after the first second; implicitfast, so that rounding grows little.
@@ -41,10 +41,12 @@ def test_one_row_a_sea_in_the_contracts_form(ik_rows):
     for row in ik_rows:
         assert list(row) == [
             *("who", "delay", "sea", "episodes", "invalid_episodes", "pos_mm", "ang_mrad"),
-            *("correction", "torque_share", "improvement"),
+            *("correction", "torque_share", "strain", "improvement"),
         ]
         assert (row["who"], row["delay"], row["episodes"]) == ("ik", "E2", EPISODES)
         assert row["invalid_episodes"] == 0
+        assert row["strain"]["steps"] == EPISODES * (SHORT.episode_steps - WARM_UP_STEPS)
+        assert row["strain"]["out_of_reach"] == 0
         for unit in ("pos_mm", "ang_mrad"):
             stats = row[unit]
             assert list(stats) == ["mean", "std", "top5", "top1", "max"]

@@ -78,7 +78,7 @@ def test_a_lead_that_diverges_is_never_the_best(who, monkeypatch):
 
 
 def test_no_controller_computes_rotations_outside_a_wall():
-    """Without walls XLA computed them again for every number of the action: 40 times the time."""
+    """Without walls XLA computed them again for every number of the action: 195 us, not 3."""
     measured = Measurement(jnp.eye(3), jnp.zeros(3), jnp.zeros((0, 12)))
     state = SimpleNamespace(measured=measured, conditions=Conditions(*[None] * 5))
     ahead = unpack_matrix(measured.rotation), unpack(measured.position, 3)

@@ -172,6 +172,14 @@ def test_effort_by_hand():
     assert effort(correction, share)["torque_share"]["at_limit"] == pytest.approx(1 / 4)
 
 
+def test_strain_counts_steps_after_the_warm_up():
+    found = np.zeros((WARM_UP_STEPS + 3, 2, 4), bool)
+    found[0] = True
+    found[-1, 0, :2] = found[-2:, 1, 3] = True
+    found[-1, 0, 3] = True
+    assert results.strain(found) == {"strain": {"steps": 12, "out_of_reach": 3, "too_fast": 2}}
+
+
 @pytest.mark.filterwarnings("error")
 def test_effort_of_nothing_finite_is_refused_not_nan():
     steps = results.LEAST_STEPS

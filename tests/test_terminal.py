@@ -29,6 +29,7 @@ def row(who="ik", sea="Wd", delay="B4_4", scale=1.0, gain=0.0):
         **{"pos_mm": errors, "ang_mrad": errors, "improvement": {"pos": better, "ang": better}},
         "correction": {"max_cm": 2.44, "max_crad": 1.82, "rate_cm_s": 2.2, "rate_crad_s": 2.1},
         "torque_share": {"mean": 0.63, "at_limit": 0.058},
+        "strain": {"steps": 47500, "out_of_reach": 0, "too_fast": 0},
     }
 
 
@@ -132,6 +133,17 @@ def test_maxima_are_said_to_repeat_only_roughly_where_servos_chatter(monkeypatch
     said = REPEAT_NOTE[:40]
     assert said in shown([row()], 150, monkeypatch)
     assert said not in shown([row()], 150, monkeypatch, replace(TASK[0], integrator="quiet"))
+
+
+def test_what_the_arm_cannot_do_is_counted_where_there_is_some(monkeypatch):
+    calm, rough = row("ik", "Wa"), row("fir", "3.5:8")
+    rough["strain"] = {"steps": 47500, "out_of_reach": 12, "too_fast": 340}
+    said = " ".join(shown([calm, rough], 150, monkeypatch).split())
+    assert (
+        "fir, 3.5:8: the corrected goal out of the arm's reach in 12 of 47500 control steps; a "
+        "joint asked to be faster than its servo takes in 340 of 47500 control steps"
+    ) in said
+    assert "ik, Wa:" not in said
 
 
 def test_effort_is_each_number_of_the_sea_where_it_is_largest(monkeypatch):

@@ -653,3 +653,20 @@ def test_arms_that_cannot_do_the_task_are_refused(tmp_path, change, message):
 def test_an_arm_without_the_tool_site_is_refused(tmp_path):
     with pytest.raises(UserError, match="--tool-site flange: the arm model's sites are: tool"):
         make_env(EnvConfig(arm=arm_file(tmp_path), tool_site="flange"), ROUGH)
+
+
+def test_what_the_arm_cannot_do_is_seen(env, first):
+    """120 deg/s, 2.09 rad/s, is what the shoulder's servo takes, 42 mrad in a control step."""
+
+    def strain(shift_rad, ik_error, before=first):
+        reference = before.reference.at[1].add(shift_rad)
+        metrics = dataclasses.replace(before.metrics, ik_error=jnp.float32(ik_error))
+        after = dataclasses.replace(before, reference=reference, metrics=metrics)
+        return tuple(bool(x) for x in env.strain(before, after))
+
+    moving = dataclasses.replace(first, step=jnp.int32(1))
+    assert strain(0.0, 1e-6, moving) == (False, False)
+    assert strain(0.041, 0.9e-4, moving) == (False, False)
+    assert strain(-0.043, 1.1e-4, moving) == (True, True)
+    assert strain(0.0, np.nan, moving) == (True, False)
+    assert strain(0.043, 0.0) == (False, False)  # the first step has no rate (authors' code)

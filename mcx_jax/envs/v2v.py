@@ -207,6 +207,13 @@ class V2VEnv:
         commands = unpack(ctrl, len(self.model.actuators))
         return jnp.stack(chain.actuate(self.model, angles, rates, commands)[0])
 
+    def strain(self, before: EnvState, after: EnvState) -> tuple[jax.Array, jax.Array]:
+        """Whether the control step between two states asked the arm for what it cannot do: () bool,
+        the corrected goal is out of its reach (the IK does not get there); () bool, a joint has to
+        be faster than its velocity servo takes."""
+        lost = servo.lost_lead(self.model, _rate(before, after.reference))
+        return ~(after.metrics.ik_error < ik.TOLERANCE), jnp.any(lost != 0.0)
+
     def _observe(
         self, arm: ArmState, goal: tuple[Mat, Vec], measured: Measurement, drawn: Conditions
     ):
