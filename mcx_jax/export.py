@@ -127,7 +127,8 @@ def main(argv: list[str] | None = None) -> None:
     from mcx_jax import startup
 
     config = cli.parse(ExportConfig, sys.argv[1:] if argv is None else argv, prog="export")
-    startup.configure("cpu")
+    for line in startup.configure("cpu"):
+        print(line)
     from mcx_jax.policy import load_run
 
     policy = load_run(config.run)

@@ -20,7 +20,7 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from mcx_jax import checkpoint, cli, evaluate, export, startup, train
+from mcx_jax import checkpoint, cli, evaluate, export, extras, startup, train
 from mcx_jax.bench import __main__ as bench_command
 from mcx_jax.config import TrainConfig, preset_config
 from mcx_jax.delay import parse_delay
@@ -289,7 +289,7 @@ def test_command_lines(name, place, monkeypatch, capsys):
     monkeypatch.setattr(startup, "configure", reached)
     monkeypatch.setattr(sea_command, "build_tables", reached)
     # Without the extra viz, which CI has not, every line for `play` would be refused at the door.
-    monkeypatch.setattr(play_command, "_require", lambda module: None)
+    monkeypatch.setattr(extras, "require", lambda module, what: None)
     monkeypatch.setattr(tempfile, "tempdir", str(place))
 
     @cases(70)
