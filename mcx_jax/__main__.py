@@ -1,5 +1,9 @@
-"""`python -m mcx_jax`: the commands, a sentence each."""
+"""`mcx COMMAND` or `python -m mcx_jax COMMAND`, the same as `python -m mcx_jax.COMMAND`.
 
+Without a command it lists all of them.
+"""
+
+import runpy
 import sys
 
 from mcx_jax import __version__
@@ -25,18 +29,23 @@ def main(argv: list[str] | None = None) -> None:
     elif words in ([], ["--help"], ["-h"]):
         print(f"mcx_jax {__version__}: motion compensation from vessel to vessel. Commands:\n")
         for name, sentence in COMMANDS.items():
-            print(f"  python -m mcx_jax.{name:10} {sentence}")
-        print("\nEach explains itself with --help.")
-    elif words[0] in COMMANDS:
-        raise UserError(f"{words[0]}: with a dot, python -m mcx_jax.{' '.join(words)}")
-    else:
-        raise UserError(
-            f"{words[0]}: no such command; use python -m mcx_jax.NAME, where NAME is one of "
-            f"{', '.join(COMMANDS)}"
+            print(f"  mcx {name:10} {sentence}")
+        print(
+            "\n`python -m mcx_jax.COMMAND` is the same. --help after a command lists its settings."
         )
+    elif words[0] in COMMANDS:
+        sys.argv = [f"mcx {words[0]}", *words[1:]]
+        runpy.run_module(f"mcx_jax.{words[0]}", run_name="__main__", alter_sys=True)
+    else:
+        raise UserError(f"{words[0]}: no such command; use one of {', '.join(COMMANDS)}")
 
 
-if __name__ == "__main__":
+def run() -> None:
+    """The installed command `mcx`."""
     from mcx_jax.startup import run_command
 
     run_command(main)
+
+
+if __name__ == "__main__":
+    run()

@@ -155,23 +155,33 @@ def test_python_m_mcx_jax_lists_every_command(repo_root, tracked, capsys):
     said = capsys.readouterr().out
     assert names - {"__main__", "startup"} == set(commands.COMMANDS)
     for name, sentence in commands.COMMANDS.items():
-        assert sentence.endswith(".") and f"python -m mcx_jax.{name} " in said
+        assert sentence.endswith(".") and f"  mcx {name} " in said
     assert max(map(len, said.splitlines())) <= 80
     commands.main(["--version"])
     assert capsys.readouterr().out == f"{mcx_jax.__version__}\n"
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["train", "--smoke"], "train: with a dot, python -m mcx_jax.train --smoke"),
-        (["fly"], "fly: no such command; use python -m mcx_jax.NAME, where NAME is one of train, "),
-    ],
-)
-def test_python_m_mcx_jax_says_what_to_type(words, said):
-    with pytest.raises(UserError) as error:
-        commands.main(words)
-    assert str(error.value).startswith(said)
+def test_a_command_that_is_none_is_one_line():
+    with pytest.raises(UserError, match="^fly: no such command; use one of train, evaluate, "):
+        commands.main(["fly"])
+
+
+def test_mcx_runs_the_command_of_that_name(repo_root):
+    """As `python -m mcx_jax.evaluate`: its own error line and exit code."""
+    command = [sys.executable, "-m", "mcx_jax", "evaluate", "ik", "--delay", "nonsense"]
+    done = subprocess.run(command, cwd=repo_root, text=True, capture_output=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("error: ") and "nonsense" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_public_names_load_when_they_are_used():
+    code = "import sys, mcx_jax; mcx_jax.configure; print('jax' in sys.modules)"
+    assert run(sys.executable, "-c", code, cwd=mcx_jax.__path__[0] + "/..") == "False\n"
+    for name in mcx_jax.__all__:
+        assert getattr(mcx_jax, name).__name__ == name
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        _ = mcx_jax.nothing
 
 
 @pytest.fixture(scope="module")
