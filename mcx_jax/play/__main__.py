@@ -94,8 +94,7 @@ def main(argv: list[str] | None = None) -> None:
     print(config.env.describe_delays(), flush=True)
     if entry.controller is None:
         fitted = fit_if_needed(entry.who, None, config.env, config.motion, "")
-        settings = {"delay": config.env.delay}  # the page warns where another one is chosen
-        entry = dataclasses.replace(entry, controller=fitted, settings=settings)
+        entry = dataclasses.replace(entry, controller=fitted)
     try:
         if config.to_file:
             to_file(config, entry)
