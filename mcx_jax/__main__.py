@@ -3,6 +3,11 @@
 Without a command it lists all of them.
 """
 
+if __name__ == "__main__":
+    from mcx_jax.command import begin
+
+    begin()
+
 import runpy
 import sys
 

@@ -13,6 +13,14 @@ import numpy as np
 from mcx_jax.assets import asset_path
 from mcx_jax.envs.arm import START_POSE_RAD
 
+HULL_M = (0.24, -1.0, 0.35)
+"""Outline of the hulls in `assets/scene.xml`, vessel axes: blunt end with its fender, middle of the
+round end, half the beam."""
+FREEBOARD_M = 0.08
+"""The least that is drawn, at the deck: below the rub rails, and below what a mesh of 11 cm rounds
+off."""
+GIVE_WAY = 0.7
+"""How steeply the water rises from there, m per m off the hull."""
 REACH_POSE_RAD = (-0.271, -1.3039, 2.2268, -2.4937, -1.5708, -0.271)
 """Joint angles (6,) that put the tool on the goal of the scene's rest pose, for still pictures."""
 
@@ -68,6 +76,38 @@ def set_sea(model: mujoco.MjModel, elevation_m: np.ndarray) -> None:
 def water_level_m(model: mujoco.MjModel) -> float:
     """Height of the mean water level in the world frame, m."""
     return float(model.geom("sea").pos[2] + model.hfield("sea").size[2] / 2)
+
+
+def below_decks_m(
+    height_m: np.ndarray,
+    x_m: np.ndarray,
+    y_m: np.ndarray,
+    decks: Sequence[tuple[np.ndarray, np.ndarray]],
+) -> np.ndarray:
+    """Height of the drawn water, m: lowered at the hulls, which are smaller than those whose motion
+    it is and follow a steep wave less, so that no deck is awash.
+
+    Args:
+        height_m: of the surface in the world frame, at points (x_m, y_m), all of one shape.
+        decks: position (3,) in m and rotation (3, 3) of each vessel in the world frame.
+    """
+    for position_m, rotation in decks:
+        x, y = x_m - position_m[0], y_m - position_m[1]
+        along_m = rotation[0, 0] * x + rotation[1, 0] * y
+        across_m = rotation[0, 1] * x + rotation[1, 1] * y
+        deck_m = position_m[2] - (rotation[0, 2] * x + rotation[1, 2] * y) / rotation[2, 2]
+        off_m = _off_hull_m(along_m, across_m)
+        height_m = np.minimum(height_m, deck_m - FREEBOARD_M + GIVE_WAY * off_m)
+    return height_m
+
+
+def _off_hull_m(along_m: np.ndarray, across_m: np.ndarray) -> np.ndarray:
+    """Horizontal distance from the outline of a hull of `assets/scene.xml`; 0 inside."""
+    blunt_m, middle_m, half_m = HULL_M
+    beyond_m = np.maximum(along_m - blunt_m, 0)
+    aft_m = np.minimum(along_m - middle_m, 0)  # the far end is round
+    beside_m = np.hypot(aft_m, across_m) - half_m
+    return np.hypot(beyond_m, np.maximum(beside_m, 0))
 
 
 def pose_scene(

@@ -99,8 +99,7 @@ def main(argv: list[str] | None = None) -> None:
     print(config.env.describe_delays(), flush=True)
     if entry.controller is None:
         fitted = fit_if_needed(entry.who, None, config.env, config.motion, "")
-        settings = {"delay": config.env.delay}  # the page warns where another one is chosen
-        entry = dataclasses.replace(entry, controller=fitted, settings=settings)
+        entry = dataclasses.replace(entry, controller=fitted)
     try:
         with interruptible():
             if config.to_file:

@@ -17,7 +17,10 @@ from mcx_jax.envs.motion import Motion, Track
 from mcx_jax.envs.state import EnvState
 from mcx_jax.envs.v2v import V2VEnv
 from mcx_jax.report.episode import side_by_side
+from mcx_jax.sea.spectrum import parse_sea
 
+RECORDED = "motion"
+"""What a recording's sea is called (`envs.motion`)."""
 EPISODES = 50
 """Episodes to choose from: those of `evaluate` with its default `--episodes`."""
 
@@ -96,6 +99,14 @@ def simulate(
     both = side_by_side(env, controller, key, sea, _sample)
     names = ("ik",) if who == "ik" else ("ik", who)
     return Take(names, both[: len(names)], name_delay(env, both[0]), env.motion.seas[sea])
+
+
+def describe_sea(sea: str) -> str:
+    """A sea's name with its numbers at full scale: "Wd (Hs 2.5 m, Tp 10 s)"."""
+    if sea == RECORDED:
+        return "recorded"
+    state = parse_sea(sea)
+    return f"{sea} (Hs {state.hs_m:g} m, Tp {state.tp_s:g} s)"
 
 
 def name_delay(env: V2VEnv, poses: Poses) -> str:

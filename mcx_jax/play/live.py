@@ -56,7 +56,7 @@ class Live:
         take = Take(("agent",), (poses,), name_delay(self._env, poses), sea)
         water = surface(take, self._motion, np.array([time_s]), self._role)
         stage = self._painter.stage
-        stage.set_sea(water, 0)
+        stage.set_sea(water, 0, poses, 0)
         self._painter.upload_sea()
         stage.place(poses, 0)
         errors = float(poses.pos_error_m[0]), float(poses.ang_error_rad[0])

@@ -8,10 +8,11 @@ import numpy as np
 import trimesh
 import viser
 
-from mcx_jax.play.stage import Stage
-from mcx_jax.play.waves import Surface
+from mcx_jax.play.stage import CLOSE_UP, Stage
 from mcx_jax.scene import water_level_m
 
+View = tuple[Any, Any]
+"""A camera's position and what it looks at, page axes, m."""
 APART_M = 1.9
 """From one controller's vessels to the other's, along -y."""
 WATER_X_M, WATER_Y_M = (-1.75, 2.4), (-0.85, 0.85)
@@ -27,13 +28,14 @@ SEGMENTS = 28
 class Tableau:
     """Two vessels, water, arm, goal and tool of one controller, under one node."""
 
-    def __init__(self, server: viser.ViserServer, stage: Stage, root: str, y_m: float):
+    def __init__(self, server: viser.ViserServer, stage: Stage, root: str, place: int):
         """
         Args:
             root: name of the node, e.g. "/ik".
-            y_m: where its world frame I lies along the page's y axis.
+            place: 0 = at the back, 1 = in front of it.
         """
-        self._server = server
+        y_m = -APART_M * place
+        self._y_m_on_page = y_m
         self.root = server.scene.add_frame(root, show_axes=False, position=(0.0, y_m, 0.0))
         self._frames = {
             body: _add_body(server, stage.model, body, root)
@@ -43,10 +45,9 @@ class Tableau:
         self._x_m, self._y_m = np.meshgrid(
             np.linspace(*WATER_X_M, WATER_GRID[0]), np.linspace(*WATER_Y_M, WATER_GRID[1])
         )
-        self._level_m = water_level_m(stage.model)
         self._water = server.scene.add_mesh_simple(
             f"{root}/water",
-            vertices=self._water_vertices(np.zeros(self._x_m.shape)),
+            vertices=self._water_vertices(np.full(self._x_m.shape, water_level_m(stage.model))),
             faces=_grid_faces(*self._x_m.shape),
             color=WATER_RGB,
             side="double",
@@ -55,10 +56,19 @@ class Tableau:
         self.label = server.scene.add_label(
             f"{root}/label",
             "",
-            position=(0.325, 0.0, 1.12),
-            anchor="bottom-center",
+            # In front of the front vessels, not over those behind.
+            position=(0.325, 0.0, 1.12) if place == 0 else (0.325, -0.95, -0.2),
+            anchor="bottom-center" if place == 0 else "top-center",
             font_screen_scale=1.4,
         )
+
+    def close_up(self, stage: Stage) -> View:
+        """Where the film's close-up is seen from: the goal is in the middle."""
+        distance_m, azimuth, elevation = CLOSE_UP[0], *map(math.radians, CLOSE_UP[1:])
+        goal = stage.data.body("goal").xpos + (0.0, self._y_m_on_page, 0.0)
+        level = math.cos(elevation)
+        ahead = (level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation))
+        return tuple(goal - distance_m * np.array(ahead)), tuple(goal)
 
     def place(self, stage: Stage) -> None:
         """Every body where the stage has it now."""
@@ -66,13 +76,17 @@ class Tableau:
             frame.position = stage.data.xpos[body]
             frame.wxyz = stage.data.xquat[body]
 
-    def set_water(self, surface: Surface, frame: int) -> None:
-        """The surface at one of its instants."""
-        elevation_m = surface.elevation_m(frame, self._x_m, self._y_m)
-        self._water.vertices = self._water_vertices(elevation_m)
+    def set_water(self, height_m: np.ndarray) -> None:
+        """The surface at `points_m`, world frame."""
+        self._water.vertices = self._water_vertices(height_m)
 
-    def _water_vertices(self, elevation_m: np.ndarray) -> np.ndarray:
-        points = np.stack([self._x_m, self._y_m, self._level_m + elevation_m], axis=-1)
+    @property
+    def points_m(self) -> tuple[np.ndarray, np.ndarray]:
+        """x and y of the water's points, world frame."""
+        return self._x_m, self._y_m
+
+    def _water_vertices(self, height_m: np.ndarray) -> np.ndarray:
+        points = np.stack([self._x_m, self._y_m, height_m], axis=-1)
         return points.reshape(-1, 3).astype(np.float32)
 
 
@@ -142,9 +156,27 @@ def _grid_faces(rows: int, columns: int) -> np.ndarray:
     return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
 
 
+def overview(tableaux: int, *, phone: bool = False) -> View:
+    """Where all vessels are seen from.
+
+    Args:
+        phone: in a tall window's upper half; viser's panel covers the lower one, and no message
+            folds it.
+    """
+    middle_y_m = -APART_M * (tableaux - 1) / 2
+    back, drop_m = (2.6, 2.2) if phone else (1.0, 0.0)
+    target = (0.325, middle_y_m, 0.12 - drop_m)
+    return tuple(np.add(target, back * np.array([-1.225, -4.0, 1.78]))), target
+
+
 def look_at(server: viser.ViserServer, tableaux: int) -> None:
     """The camera that new visitors get."""
-    middle_y_m = -APART_M * (tableaux - 1) / 2
-    server.initial_camera.look_at = (0.325, middle_y_m, 0.12)
-    server.initial_camera.position = (-0.9, middle_y_m - 4.0, 1.9)
+    server.initial_camera.position, server.initial_camera.look_at = overview(tableaux)
     server.initial_camera.fov = math.radians(42)
+
+
+def aim(client: viser.ClientHandle, view: View) -> None:
+    """Move a visitor's camera."""
+    with client.atomic():
+        client.camera.position = view[0]  # which takes its target along
+        client.camera.look_at = view[1]

@@ -50,7 +50,7 @@ class Picture:
         draw.text((16, TITLE_PX / 2), self._title, "white", font(21), anchor="lm")
         clock = f"{self._take.time_s[step]:.1f} s"
         draw.text((WIDTH_PX - 16, TITLE_PX / 2), clock, "white", font(21), anchor="rm")
-        self._stage.set_sea(self._surface, frame)
+        self._stage.set_sea(self._surface, frame, self._take.poses[0], step)
         self._painter.upload_sea()
         count = len(self._take.names)
         width = (WIDTH_PX - GAP_PX * (count - 1)) // count

@@ -11,7 +11,14 @@ from mcx_jax.envs.model import ARMS
 from mcx_jax.play import gl
 from mcx_jax.play.episode import Poses
 from mcx_jax.play.waves import Surface
-from mcx_jax.scene import build_scene, pose_scene, sea_points_m, set_sea
+from mcx_jax.scene import (
+    below_decks_m,
+    build_scene,
+    pose_scene,
+    sea_points_m,
+    set_sea,
+    water_level_m,
+)
 
 CLOSE_UP = (0.24, 75.0, 12.0)
 """The close-up's camera about the goal: distance m, azimuth and elevation deg. From below, since
@@ -29,6 +36,7 @@ class Stage:
         self.data = mujoco.MjData(self.model)
         self.tool_site = env.tool_site
         self._sea_points_m = sea_points_m(self.model)
+        self._level_m = water_level_m(self.model)
 
     def place(self, poses: Poses, step: int) -> None:
         """Vessels, goal, arm and tool marker at the end of a control step, 0 = the first."""
@@ -42,9 +50,27 @@ class Stage:
             goal=(poses.goal_m[step], quaternion(poses.goal_rotation[step])),
         )
 
-    def set_sea(self, surface: Surface, frame: int) -> None:
-        """The sea at one of the surface's instants."""
-        set_sea(self.model, surface.elevation_m(frame, *self._sea_points_m))
+    def set_sea(self, surface: Surface, frame: int, poses: Poses, step: int) -> None:
+        """The sea at one of the surface's instants, which is this control step."""
+        height_m = self.water_m(surface, frame, poses, step, *self._sea_points_m)
+        set_sea(self.model, height_m - self._level_m)
+
+    def water_m(
+        self,
+        surface: Surface,
+        frame: int,
+        poses: Poses,
+        step: int,
+        x_m: np.ndarray,
+        y_m: np.ndarray,
+    ) -> np.ndarray:
+        """Height of the drawn water in the world frame at points of one shape, m."""
+        decks = [
+            (poses.a_m[step], poses.a_rotation[step]),
+            (poses.b_m[step], poses.b_rotation[step]),
+        ]
+        height_m = self._level_m + surface.elevation_m(frame, x_m, y_m)
+        return below_decks_m(height_m, x_m, y_m, decks)
 
 
 def quaternion(rotation: np.ndarray) -> np.ndarray:
