@@ -9,13 +9,14 @@ import subprocess
 import sys
 import threading
 import urllib.request
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from browser import blank, off_screen_opengl, tab
+from browser import off_screen_opengl, tab
 
 from mcx_jax import extras
 from mcx_jax.controllers import CLASSICAL
@@ -28,9 +29,9 @@ from mcx_jax.errors import UserError
 from mcx_jax.evaluate import errors_beside_ik
 from mcx_jax.play import gl
 from mcx_jax.play.__main__ import PlayConfig, main
-from mcx_jax.play.episode import EPISODES, simulate
-from mcx_jax.play.stage import Stage
-from mcx_jax.play.video import STRIDE
+from mcx_jax.play.episode import EPISODES, describe_sea, simulate
+from mcx_jax.play.stage import Painter, Stage
+from mcx_jax.play.video import STRIDE, title
 from mcx_jax.play.waves import surface
 from mcx_jax.scene import FREEBOARD_M, below_decks_m
 from mcx_jax.sea.hydro import VesselKnobs
@@ -219,6 +220,27 @@ def test_the_close_up_does_not_cover_the_tool():
     assert np.all(across_px < width - 10 - picture.CLOSE_UP_PX), across_px
 
 
+@pytest.mark.parametrize("camera", ["hero", "pair"])
+def test_scale_bars_are_as_long_as_what_they_stand_for(take, camera):
+    """Two points 0.5 m apart at the goal, across the picture, through a pinhole camera."""
+    stage = Stage(TASK)
+    stage.place(take.poses[0], 0)
+    seen, goal_m = stage.data.camera(camera), stage.data.body("goal").xpos
+    right, up, back = seen.xmat.reshape(3, 3).T
+    focal_px = 215 / math.tan(math.radians(float(stage.model.camera(camera).fovy[0])) / 2)
+    ends = [goal_m - seen.xpos, goal_m + 0.5 * right - seen.xpos]
+    across_px = [focal_px * (right @ end) / -(back @ end) for end in ends]
+    fake = SimpleNamespace(stage=stage)
+    drawn_px = 0.5 * Painter.wide_px_per_m(fake, 430, camera)  # pyright: ignore
+    assert drawn_px == pytest.approx(across_px[1] - across_px[0], rel=1e-6)
+
+
+def test_a_films_title_has_the_seas_numbers_and_the_scale(take):
+    assert title(take).endswith("|  sea Wd (Hs 2.5 m, Tp 10 s), model 1:10")
+    assert describe_sea("3.0:11-coupled") == "3.0:11-coupled (Hs 3 m, Tp 11 s)"
+    assert describe_sea("motion") == "recorded"
+
+
 def test_no_opengl_is_one_line(monkeypatch):
     monkeypatch.setattr(gl, "_TRY", "raise SystemExit(1)")
     monkeypatch.setenv("MUJOCO_GL", "disable")
@@ -404,10 +426,10 @@ def running(player):
 
 
 def wait_until(page, condition, what):
-    for _ in range(600):  # a busy machine, software WebGL
+    for _ in range(300):  # a busy machine, software WebGL
         if condition():
             return
-        page.wait_for_timeout(100)
+        page.wait_for_timeout(200)
     raise AssertionError(f"not within a minute: {what}")
 
 
@@ -421,7 +443,7 @@ def test_a_browser_shows_the_page_and_its_controls_work(player, tmp_path):
     console; the canvas is not blank."""
     player.playing = True
     player.wanted = dataclasses.replace(player.wanted, who="extrapolate", sea="Wd", episode=0)
-    with running(player), tab(tmp_path / "profile", 800, 500) as opened:
+    with running(player), tab(tmp_path / "profile", 800, 450) as opened:
         page = opened.page
         page.set_default_timeout(60_000)
         page.goto(player.url)
@@ -434,13 +456,13 @@ def test_a_browser_shows_the_page_and_its_controls_work(player, tmp_path):
         page.get_by_role("button", name="New episode").click()
         wait_until(page, lambda: "episode 1" in player._said.content, "the episode")
         page.get_by_text("sea Wa (Hs 1 m, Tp 6 s)").wait_for()
-        overview = opened.picture()
+        # Left of the panel, below the notice of software WebGL; viser fades the scene in.
+        canvas = lambda: opened.picture()[200:, :480].astype(int)  # noqa: E731
+        wait_until(page, lambda: canvas().std() > 30, "vessels on the canvas")
+        overview = canvas()
         choose(page, "view", "close-up of controller")
-        wait_until(page, lambda: near(player), "the close-up")
-        close_up = opened.picture()
-        for picture in (overview, close_up):
-            assert not blank(picture[200:, :480]), "the canvas left of the panel"
-        assert np.abs(overview[200:, :480].astype(int) - close_up[200:, :480]).mean() > 5
+        wait_until(page, lambda: near(player), "the camera's close-up")
+        wait_until(page, lambda: np.abs(overview - canvas()).mean() > 10, "its picture")
         said = [x for x in opened.complaints if not any(known in x for known in HARMLESS)]
         assert said == []
     player.playing = True

@@ -12,9 +12,13 @@ from mcx_jax.play.waves import Surface
 
 WIDTH_PX, HEIGHT_PX = 1280, 720
 TITLE_PX, PANEL_PX, GAP_PX = 46, 430, 4
-CLOSE_UP_PX = 168
-PLOT_BOX_PX = (54, 508, 1256, 688)
+CLOSE_UP_PX = 180
+PLOT_BOX_PX = (62, 516, 1252, 682)
 """Left, top, right, bottom of the axes."""
+LABEL_PX = 20
+"""Size of the plot's letters and of the scale's."""
+WIDE_BAR_M, CLOSE_BAR_M = 0.5, 0.02
+"""Lengths of the scale bars, at the goal's distance."""
 INK, MUTED, GRID, PAPER = (palette.LIGHT[name] for name in ("ink", "muted", "grid", "paper"))
 TICKS_MM = (0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200)
 """Distances of grid lines to choose from."""
@@ -47,9 +51,9 @@ class Picture:
         image = Image.new("RGB", (WIDTH_PX, HEIGHT_PX), PAPER)
         draw = ImageDraw.Draw(image)
         draw.rectangle((0, 0, WIDTH_PX, TITLE_PX), fill=INK)
-        draw.text((16, TITLE_PX / 2), self._title, "white", font(21), anchor="lm")
+        draw.text((16, TITLE_PX / 2), self._title, "white", font(22), anchor="lm")
         clock = f"{self._take.time_s[step]:.1f} s"
-        draw.text((WIDTH_PX - 16, TITLE_PX / 2), clock, "white", font(21), anchor="rm")
+        draw.text((WIDTH_PX - 16, TITLE_PX / 2), clock, "white", font(22), anchor="rm")
         self._stage.set_sea(self._surface, frame, self._take.poses[0], step)
         self._painter.upload_sea()
         count = len(self._take.names)
@@ -75,12 +79,13 @@ class Picture:
         for mm in np.arange(0, self._top_mm, self._tick_mm):
             y = bottom - up * mm
             draw.line((left, y, right, y), MUTED if mm == 0 else GRID, 1)
-            draw.text((left - 8, y), f"{mm:g}", INK, font(15), anchor="rm")
-        draw.text((14, top - 20), "position error, mm, over time, s", INK, font(15), anchor="lm")
+            draw.text((left - 8, y), f"{mm:g}", INK, font(LABEL_PX), anchor="rm")
+        what = "position error, mm, over time, s"
+        draw.text((14, top - 22), what, INK, font(LABEL_PX), anchor="lm")
         every_s = max(1, round(time_s[-1] / 10))
         for second in np.arange(0, time_s[-1] + 1e-9, every_s):
             x = left + across * second
-            draw.text((x, bottom + 8), f"{second:g}", INK, font(15), anchor="mt")
+            draw.text((x, bottom + 8), f"{second:g}", INK, font(LABEL_PX), anchor="mt")
         for i, poses in enumerate(self._take.poses):
             mm = np.nan_to_num(1e3 * poses.pos_error_m[: step + 1], nan=self._top_mm)
             y = bottom - up * np.clip(mm, 0, self._top_mm)
@@ -105,7 +110,11 @@ def panel(
         errors: dp in m, da in rad.
     """
     image = Image.fromarray(painter.wide(*size_px, camera))
-    inset(image, painter.close_up(CLOSE_UP_PX), size_px[0] - 10, 10)
+    close = Image.fromarray(painter.close_up(CLOSE_UP_PX))
+    scale_bar(close, CLOSE_BAR_M * painter.close_up_px_per_m(CLOSE_UP_PX), "2 cm", 16)
+    inset(image, np.asarray(close), size_px[0] - 10, 10)
+    wide_bar_px = WIDE_BAR_M * painter.wide_px_per_m(size_px[1], camera)
+    scale_bar(image, wide_bar_px, "0.5 m (5 m at full scale)", LABEL_PX)
     draw = ImageDraw.Draw(image)
     chip(draw, (10, 10), *label, 22)
     chip(draw, (10, 50), f"{1e3 * errors[0]:.2f} mm", INK, 20)
@@ -116,12 +125,21 @@ def panel(
 def inset(image: Image.Image, close_up: np.ndarray, right: int, top: int) -> None:
     """Put a close-up (size, size, 3) with its caption into a picture, its right upper corner so."""
     size = len(close_up)
-    frame = (right - size - 2, top - 2, right + 1, top + size + 22)
+    frame = (right - size - 2, top - 2, right + 1, top + size + 26)
     draw = ImageDraw.Draw(image)
     draw.rounded_rectangle(frame, 4, fill="white")
     image.paste(Image.fromarray(close_up), (right - size, top))
-    caption = right - size / 2, top + size + 10
-    draw.text(caption, "thick: goal   thin: tool", INK, font(14), anchor="mm")
+    caption = right - size / 2, top + size + 12
+    draw.text(caption, "thick: goal, thin: tool", INK, font(17), anchor="mm")
+
+
+def scale_bar(image: Image.Image, length_px: float, text: str, size: int) -> None:
+    """A bar on a plate of white in the lower left corner, and what it is long."""
+    draw, high = ImageDraw.Draw(image), image.height
+    width = max(length_px, draw.textlength(text, font(size))) + 16
+    draw.rounded_rectangle((6, high - size - 24, 6 + width, high - 6), 5, fill="white")
+    draw.text((14, high - size - 20), text, INK, font(size), anchor="lt")
+    draw.rectangle((14, high - 14, 14 + length_px, high - 11), fill=INK)
 
 
 def chip(draw: ImageDraw.ImageDraw, corner: Sequence[float], text: str, colour: str, size: int):

@@ -12,7 +12,7 @@ import numpy as np
 from mcx_jax.delay import CONTROL_DT_S
 from mcx_jax.env_config import EnvConfig, MotionConfig
 from mcx_jax.errors import UserError, reason
-from mcx_jax.play.episode import Take
+from mcx_jax.play.episode import Take, describe_sea
 from mcx_jax.play.picture import HEIGHT_PX, WIDTH_PX, Picture
 from mcx_jax.play.stage import Painter, Stage
 from mcx_jax.play.waves import surface
@@ -25,7 +25,8 @@ FPS = round(1 / (STRIDE * CONTROL_DT_S))
 def title(take: Take) -> str:
     """What the picture shows."""
     what = "Tool on vessel A, goal on vessel B"
-    return f"{what}  |  delay {take.delay}  |  sea {take.sea}"
+    sea = describe_sea(take.sea)
+    return f"{what}  |  delay {take.delay}  |  sea {sea}, model 1:10"
 
 
 def write_film(
