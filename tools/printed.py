@@ -40,7 +40,7 @@ EXTRAPOLATE = "evaluate extrapolate --delay B4_4 --sea Wd"
 POLICY = "evaluate runs/B4_4-first-order-s0 --delay"
 SLOW = {
     "shipped": "evaluate shipped:B4_4 --delay B4_4",
-    "quick-train": "train --algo first-order --delay B4_4 --total-steps 500000 --run-dir runs/quick",
+    "quick-train": "train --algo first-order --total-steps 500000 --run-dir runs/quick",
     "sea": "sea",
     "ik": "evaluate ik --delay B4_4 --sea all",
     "extrapolate": EXTRAPOLATE,
