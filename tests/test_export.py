@@ -271,8 +271,9 @@ def test_numpy_runner_refuses_what_would_spoil_its_memory(exported, run_dir, tmp
         numpy_policy.Policy(old)
 
 
-def test_readme_example_runs(repo_root, exported, tmp_path, monkeypatch, rng):
-    blocks = re.findall(r"```python\n(.*?)```", (repo_root / "README.md").read_text(), re.DOTALL)
+def test_the_pages_example_runs(repo_root, exported, tmp_path, monkeypatch, rng):
+    page = (repo_root / "docs" / "export.md").read_text()
+    blocks = re.findall(r"```py\n(.*?)```", page, re.DOTALL)
     (code,) = [block for block in blocks if "numpy_policy" in block]
     assert len(code.splitlines()) <= 10
     shutil.copy(exported["npz"], tmp_path / "policy.npz")
