@@ -35,9 +35,7 @@ def main(argv: list[str] | None = None) -> None:
         print(f"mcx_jax {__version__}: motion compensation from vessel to vessel. Commands:\n")
         for name, sentence in COMMANDS.items():
             print(f"  mcx {name:10} {sentence}")
-        print(
-            "\n`python -m mcx_jax.COMMAND` is the same. --help after a command lists its settings."
-        )
+        print("\nThe same: python -m mcx_jax.COMMAND. Settings: mcx COMMAND --help")
     elif words[0] in COMMANDS:
         sys.argv = [f"mcx {words[0]}", *words[1:]]
         runpy.run_module(f"mcx_jax.{words[0]}", run_name="__main__", alter_sys=True)
