@@ -1,0 +1,1 @@
+"""One arm on a moving base: model, kinematics, dynamics, servos, delay."""

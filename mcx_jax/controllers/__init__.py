@@ -1,0 +1,1 @@
+"""Everything that `evaluate` takes by name."""

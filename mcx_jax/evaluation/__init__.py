@@ -1,0 +1,1 @@
+"""Errors of controllers on test episodes."""

@@ -1,0 +1,1 @@
+"""Other people's interfaces: Gymnasium, MuJoCo Playground, MJX."""

@@ -1,0 +1,1 @@
+"""What acts: the networks, the policy file and its other forms."""
