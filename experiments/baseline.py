@@ -13,15 +13,15 @@ import time
 
 from record import evaluation_rows, kept, provenance, write_rows
 
-from mcx_jax import startup
-from mcx_jax.delay import NAMED_DELAYS
-from mcx_jax.env_config import EnvConfig, MotionConfig
+from mcx_jax.compute import startup
+from mcx_jax.config.delay import NAMED_DELAYS
+from mcx_jax.config.task import EnvConfig, MotionConfig
 
 
 def main() -> None:
     startup.configure()
+    from mcx_jax.controllers.by_name import WHO, fit_if_needed, load_controller
     from mcx_jax.evaluate import evaluate
-    from mcx_jax.roster import WHO, fit_if_needed, load_controller
 
     quiet = "--quiet" in sys.argv
     names = [word for word in sys.argv[1:] if word != "--quiet"] or ["ik"]

@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 from record import commit, provenance, write_rows
 
-from mcx_jax import startup
-from mcx_jax.checkpoint import latest
-from mcx_jax.env_config import EnvConfig, MotionConfig
+from mcx_jax.compute import startup
+from mcx_jax.config.task import EnvConfig, MotionConfig
+from mcx_jax.controllers.by_name import fit_if_needed, load_controller
 from mcx_jax.evaluate import evaluate
-from mcx_jax.roster import fit_if_needed, load_controller
-from mcx_jax.run_dir import CONFIG, stored_config
+from mcx_jax.runs.checkpoint import latest
+from mcx_jax.runs.run_dir import CONFIG, stored_config
 
 GOALS = ("static", "circle", "lissajous")
 RUN = Path("runs/B4_4-first-order-lissajous-s0")

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mcx_jax import startup
-from mcx_jax.env_config import EnvConfig, MotionConfig
+from mcx_jax.compute import startup
+from mcx_jax.config.task import EnvConfig, MotionConfig
 from mcx_jax.play import gl
 
 EPISODE, AT_S = 0, 12.5
@@ -22,11 +22,11 @@ def main() -> None:
     startup.configure("cpu")
     from PIL import Image
 
-    from mcx_jax.controllers import CLASSICAL
+    from mcx_jax.controllers.classical import CLASSICAL
     from mcx_jax.envs.v2v import make_env
     from mcx_jax.play.episode import simulate
     from mcx_jax.play.picture import inset
-    from mcx_jax.play.stage import Painter, Stage
+    from mcx_jax.play.renderer import Painter, Stage
     from mcx_jax.play.waves import surface
 
     task, motion = EnvConfig(), MotionConfig(sea="Wd")

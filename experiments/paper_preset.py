@@ -13,8 +13,8 @@ from pathlib import Path
 
 from record import provenance, run_rows, write_rows
 
-from mcx_jax import startup
-from mcx_jax.run_dir import METRICS, whole_rows
+from mcx_jax.compute import startup
+from mcx_jax.runs.run_dir import METRICS, whole_rows
 
 KEPT = {
     **{"iteration": "d", "steps": "d", "pos_error_mm": ".3f", "ang_error_mrad": ".3f"},

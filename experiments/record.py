@@ -58,7 +58,7 @@ def kept(name: str, column: str, anew: list[str]) -> list[dict]:
 def evaluation_rows(rows: list[dict], seconds: float) -> list[dict]:
     """Result rows of `mcx_jax.evaluate` as CSV rows, beside the paper's figures; gains over the IK
     baseline of the worst 5 %, 1 % and the maximum in per cent."""
-    from mcx_jax.results import paper_errors
+    from mcx_jax.evaluation.statistics import paper_errors
 
     out = []
     for r in rows:
@@ -91,9 +91,9 @@ def evaluation_rows(rows: list[dict], seconds: float) -> list[dict]:
 def run_rows(run: Path) -> list[dict]:
     """`ik` and every seed of a trained run on the four seas as CSV rows, with the run's training
     steps (of one seed) and seconds (of all)."""
+    from mcx_jax.controllers.by_name import load_controller
     from mcx_jax.evaluate import evaluate_beside_ik
-    from mcx_jax.roster import load_controller
-    from mcx_jax.run_dir import METRICS, POLICY, stored_config
+    from mcx_jax.runs.run_dir import METRICS, POLICY, stored_config
 
     config = stored_config(run)
     last = json.loads((run / METRICS).read_text().splitlines()[-1])

@@ -20,17 +20,17 @@ import jax.numpy as jnp
 import numpy as np
 from record import commit, kept, provenance, write_rows
 
-from mcx_jax import startup
+from mcx_jax.arm.plant import Plant
 from mcx_jax.assets import SHIPPED
-from mcx_jax.controllers import CLASSICAL
-from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
+from mcx_jax.compute import startup
+from mcx_jax.config.task import ConditionsConfig, EnvConfig, MotionConfig
+from mcx_jax.controllers.by_name import FITTED, load_controller
+from mcx_jax.controllers.classical import CLASSICAL
+from mcx_jax.controllers.fitted import fitted
 from mcx_jax.envs.conditions import Conditions, Noise
-from mcx_jax.envs.plant import Plant
 from mcx_jax.envs.v2v import make_env
-from mcx_jax.episodes import run_everywhere
-from mcx_jax.fitted import fitted
-from mcx_jax.results import WARM_UP_STEPS
-from mcx_jax.roster import FITTED, load_controller
+from mcx_jax.evaluation.episodes import run_everywhere
+from mcx_jax.evaluation.statistics import WARM_UP_STEPS
 
 DELAYS = ("B4_4", "E1", "E2", "butter:4:8Hz")
 EPISODES, SEED = 24, 0

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from record import commit, provenance, write_rows
 
-from mcx_jax.startup import DEVICES_FLAG, PASSES_FLAG, SPLIT_PASS
+from mcx_jax.compute.startup import DEVICES_FLAG, PASSES_FLAG, SPLIT_PASS
 
 ENVS_PER_DEVICE = 1024
 WINDOW_STEPS = 32

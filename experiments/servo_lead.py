@@ -18,14 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 from record import provenance, write_rows
 
-from mcx_jax import startup
-from mcx_jax.delay import CONTROL_DT_S
-from mcx_jax.env_config import MotionConfig
-from mcx_jax.envs import servo
+from mcx_jax.arm import servo
+from mcx_jax.compute import startup
+from mcx_jax.config.delay import CONTROL_DT_S
+from mcx_jax.config.task import MotionConfig
+from mcx_jax.controllers.by_name import load_controller
 from mcx_jax.envs.v2v import make_env
-from mcx_jax.results import WARM_UP_STEPS
-from mcx_jax.roster import load_controller
-from mcx_jax.run_dir import stored_config
+from mcx_jax.evaluation.statistics import WARM_UP_STEPS
+from mcx_jax.runs.run_dir import stored_config
 
 SHARES = (0.0, 0.5, 0.7, 0.85, 1.0)
 EPISODES, AFTER_STEPS = 400, 10

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from record import FOLDER, commit, provenance, write_rows
 
-from mcx_jax import startup
+from mcx_jax.compute import startup
 
 
 def main() -> None:

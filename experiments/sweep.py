@@ -14,9 +14,9 @@ from pathlib import Path
 
 from record import commit, kept, run_rows, write_rows
 
-from mcx_jax import startup
-from mcx_jax.checkpoint import latest
-from mcx_jax.run_dir import CONFIG, stored_config
+from mcx_jax.compute import startup
+from mcx_jax.runs.checkpoint import latest
+from mcx_jax.runs.run_dir import CONFIG, stored_config
 
 DELAYS = ("E0", "B4_21", "E1", "B4_4", "E2")
 RUNS = Path("runs")

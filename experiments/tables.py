@@ -45,7 +45,7 @@ finds is the one that `extrapolate` has, so that their errors are the same in ev
 
 def over_seeds(name: str) -> list[dict[str, str]]:
     """Rows of experiments/NAME.csv, one for each delay and sea: interquartile means over seeds."""
-    from mcx_jax.results import interquartile_mean
+    from mcx_jax.evaluation.statistics import interquartile_mean
 
     groups: dict[tuple[str, str, str], list[dict[str, str]]] = {}
     for row in read(name):
@@ -203,7 +203,7 @@ def _over_seeds_line(name: str) -> list[str]:
     """How far seeds differ, if a delay has several."""
     import numpy as np
 
-    from mcx_jax.results import bootstrap_interval, interquartile_mean
+    from mcx_jax.evaluation.statistics import bootstrap_interval, interquartile_mean
 
     groups: dict[tuple[str, str], list[dict[str, str]]] = {}
     for row in read(name):
@@ -356,7 +356,7 @@ def _below_by_seed(name: str) -> str:
 
 def _below_paper(cell: dict[str, str]) -> list[str]:
     """["checked", cells whose improvement is smaller than the paper's]; [] without such columns."""
-    from mcx_jax.paper import table3
+    from mcx_jax.evaluation.paper import table3
 
     if "gain_pos_max" not in cell:
         return []
@@ -451,7 +451,7 @@ def presets() -> str:
     """Where the presets differ, from the code."""
     from dataclasses import fields
 
-    from mcx_jax.config import preset_config
+    from mcx_jax.config.training import preset_config
 
     fast, paper = preset_config("fast"), preset_config("paper")
     rows = [["`--num-envs`", str(fast.num_envs), str(paper.num_envs)]]

@@ -8,16 +8,16 @@ them: `mcx_jax.train` and `mcx_jax.evaluate` are those commands' modules.
 __version__ = "0.1.0"
 
 _HOME = {
-    "ConditionsConfig": "mcx_jax.env_config",
-    "EnvConfig": "mcx_jax.env_config",
-    "MotionConfig": "mcx_jax.env_config",
-    "TrainConfig": "mcx_jax.config",
+    "ConditionsConfig": "mcx_jax.config.task",
+    "EnvConfig": "mcx_jax.config.task",
+    "MotionConfig": "mcx_jax.config.task",
+    "TrainConfig": "mcx_jax.config.training",
     "UserError": "mcx_jax.errors",
-    "configure": "mcx_jax.startup",
-    "load_controller": "mcx_jax.roster",
-    "load_policy": "mcx_jax.policy",
+    "configure": "mcx_jax.compute.startup",
+    "load_controller": "mcx_jax.controllers.by_name",
+    "load_policy": "mcx_jax.policy.file",
     "make_env": "mcx_jax.envs.v2v",
-    "step": "mcx_jax.mjx_step",
+    "step": "mcx_jax.integrations.mjx_step",
 }
 """{public name: the module that defines it}."""
 

@@ -4,7 +4,7 @@ Without a command it lists all of them.
 """
 
 if __name__ == "__main__":
-    from mcx_jax.command import begin
+    from mcx_jax.console.command import begin
 
     begin()
 
@@ -45,7 +45,7 @@ def main(argv: list[str] | None = None) -> None:
 
 def run() -> None:
     """The installed command `mcx`."""
-    from mcx_jax.startup import run_command
+    from mcx_jax.compute.startup import run_command
 
     run_command(main)
 

@@ -14,8 +14,8 @@ class UserError(Exception):
     """A mistake in what the user asked for.
 
     The message is one line that says what is wrong, what is allowed and what to do. The commands
-    print it without a traceback and exit with code 2 (`mcx_jax.startup.run_command`). Whatever it
-    quotes, it stays one line: what cannot be printed is escaped.
+    print it without a traceback and exit with code 2 (`mcx_jax.compute.startup.run_command`).
+    Whatever it quotes, it stays one line: characters that cannot be printed are escaped.
     """
 
     def __str__(self) -> str:

@@ -5,7 +5,7 @@ file. The same seed gives the same motion and the same goals to everyone.
 """
 
 if __name__ == "__main__":
-    from mcx_jax.command import begin
+    from mcx_jax.console.command import begin
 
     begin()
 
@@ -17,12 +17,12 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from mcx_jax.config import check_seed
-from mcx_jax.delay import parse_delay
-from mcx_jax.env_config import EnvConfig, MotionConfig
+from mcx_jax.config.delay import parse_delay
+from mcx_jax.config.task import EnvConfig, MotionConfig
+from mcx_jax.config.training import check_seed
+from mcx_jax.console.terminal import silent, working
+from mcx_jax.controllers.by_name import fit_if_needed, informed, load_controller
 from mcx_jax.errors import UserError
-from mcx_jax.roster import fit_if_needed, informed, load_controller
-from mcx_jax.terminal import silent, working
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Errors:
 
     def rows(self) -> list[dict[str, Any]]:
         """One result row a sea (without the improvement)."""
-        from mcx_jax.results import effort, row, strain
+        from mcx_jax.evaluation.statistics import effort, row, strain
 
         return [
             row(self.who, self.delay, sea, self.pos_m[:, i], self.ang_rad[:, i], self.valid[i])
@@ -92,7 +92,7 @@ def evaluation_env(env_config: EnvConfig, motion_config: MotionConfig):
         UserError: episodes that end within the warm-up.
     """
     from mcx_jax.envs.v2v import make_env
-    from mcx_jax.results import LEAST_STEPS, WARM_UP_STEPS
+    from mcx_jax.evaluation.statistics import LEAST_STEPS, WARM_UP_STEPS
 
     if env_config.episode_steps < LEAST_STEPS:
         raise UserError(
@@ -114,9 +114,9 @@ def errors_beside_ik(
     """Errors of the IK baseline and of a controller on the same episodes; `ik` runs alone.
 
     Args:
-        say: what happens is said to it (`mcx_jax.terminal.working`).
+        say: what happens is said to it (`mcx_jax.console.terminal.working`).
     """
-    from mcx_jax.episodes import episode_errors
+    from mcx_jax.evaluation.episodes import episode_errors
 
     names = ("ik",) if who == "ik" else ("ik", who)
     gains = (0.0, 1.0)[: len(names)]
@@ -155,10 +155,10 @@ def evaluate_beside_ik(
 
     Args:
         who: the controller's name in the result; `ik` runs the baseline alone.
-        controller: see mcx_jax.controllers.
+        controller: see mcx_jax.controllers.classical.
         episodes: per sea.
         seed: of the windows of motion and the goals; the same for every controller.
-        say: what happens is said to it (`mcx_jax.terminal.working`).
+        say: what happens is said to it (`mcx_jax.console.terminal.working`).
 
     Returns:
         (rows of ik, rows of who), one a sea, as described in the README (section Commands).
@@ -176,7 +176,7 @@ def rows_beside_ik(
     errors: list[Errors],
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """(rows of ik, rows of the other) with the improvement over ik, from `errors_beside_ik`."""
-    from mcx_jax.results import add_improvement
+    from mcx_jax.evaluation.statistics import add_improvement
 
     rows = [part.rows() for part in errors]
     for part in rows:
@@ -201,14 +201,17 @@ def evaluate(
 
 def main(argv: list[str] | None = None) -> None:
     """Command line."""
-    from mcx_jax import cli, startup
-    from mcx_jax.result_table import print_table
+    from mcx_jax.compute import startup
+    from mcx_jax.config import command_line
+    from mcx_jax.evaluation.table import print_table
 
     argv = list(sys.argv[1:] if argv is None else argv)
-    config = cli.parse(EvaluateConfig, cli.optional_value(argv, "--json", "-"), prog="evaluate")
+    config = command_line.parse(
+        EvaluateConfig, command_line.optional_value(argv, "--json", "-"), prog="evaluate"
+    )
     quiet = config.json == "-"
     report = sys.stderr if quiet else sys.stdout
-    cli.check_output("--json", config.json)
+    command_line.check_output("--json", config.json)
     for line in startup.configure(config.device, mjx=config.env.physics == "mjx"):
         print(line, file=report)
     print(config.env.describe_delays(), file=report)
@@ -226,10 +229,10 @@ def main(argv: list[str] | None = None) -> None:
     if quiet:
         print(text)
     elif config.json:
-        cli.write_output("--json", config.json, text + "\n")
+        command_line.write_output("--json", config.json, text + "\n")
 
 
 if __name__ == "__main__":
-    from mcx_jax.startup import run_command
+    from mcx_jax.compute.startup import run_command
 
     run_command(main)

@@ -1,9 +1,9 @@
 """`python -m mcx_jax.export RUN --out FILE`: a trained policy in a form that runs elsewhere.
 
 The ending of FILE says the form. All are one control step, `observation, memory -> action, memory`,
-with the normalisation inside; the interface (`mcx_jax.interface`) is printed.
+with the normalisation inside; the interface (`mcx_jax.policy.interface`) is printed.
 
-- `.npz`: weights by name and the interface; `mcx_jax.numpy_policy` runs it with NumPy alone.
+- `.npz`: weights by name and the interface; `mcx_jax.policy.numpy_policy` runs it with NumPy alone.
 - `.onnx`: inputs `observation` (N, 38) and the memory `c`, `h` (N, H); outputs `action` (N, 6),
   `c_next`, `h_next`; the interface is the metadata property `interface`. Needs the extra `export`.
 - `.stablehlo`: the same names, for JAX without mcx_jax:
@@ -16,7 +16,7 @@ with the normalisation inside; the interface (`mcx_jax.interface`) is printed.
 """
 
 if __name__ == "__main__":
-    from mcx_jax.command import begin
+    from mcx_jax.console.command import begin
 
     begin()
 
@@ -27,11 +27,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from mcx_jax import cli, extras
+from mcx_jax import extras
+from mcx_jax.config import command_line
 from mcx_jax.errors import UserError, reason
 
 if TYPE_CHECKING:
-    from mcx_jax.policy import Policy
+    from mcx_jax.policy.file import Policy
 
 FORMS = (".npz", ".onnx", ".stablehlo")
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
@@ -49,7 +50,7 @@ class ExportConfig:
 
     def __post_init__(self) -> None:
         path = Path(self.out)
-        cli.check_name("--out", path)
+        command_line.check_name("--out", path)
         if path.suffix not in FORMS:
             raise UserError(
                 f"--out {self.out}: the ending says the form: use one of {', '.join(FORMS)}"
@@ -68,10 +69,10 @@ def export(policy: "Policy", path: Path) -> None:
     Raises:
         UserError: the file cannot be written, or the form does not know the policy's cell.
     """
-    from mcx_jax.policy import npz_bytes, write_whole
+    from mcx_jax.policy.file import npz_bytes, write_whole
 
     if path.suffix == ".onnx":
-        from mcx_jax.export_onnx import onnx_bytes
+        from mcx_jax.policy.onnx import onnx_bytes
 
         content = onnx_bytes(policy)
     else:
@@ -88,7 +89,7 @@ def stablehlo_bytes(policy: "Policy") -> bytes:
     import jax.numpy as jnp
     from jax import export as jax_export
 
-    from mcx_jax.policy import act, init_carry
+    from mcx_jax.policy.file import act, init_carry
 
     carry_like = init_carry(policy)
     structure = jax.tree.structure(carry_like)
@@ -124,12 +125,12 @@ def interface_lines(policy: "Policy") -> list[str]:
 
 def main(argv: list[str] | None = None) -> None:
     """Command line."""
-    from mcx_jax import startup
+    from mcx_jax.compute import startup
 
-    config = cli.parse(ExportConfig, sys.argv[1:] if argv is None else argv, prog="export")
+    config = command_line.parse(ExportConfig, sys.argv[1:] if argv is None else argv, prog="export")
     for line in startup.configure("cpu"):
         print(line)
-    from mcx_jax.policy import load_run
+    from mcx_jax.policy.file import load_run
 
     policy = load_run(config.run)
     export(policy, Path(config.out))
@@ -139,6 +140,6 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    from mcx_jax.startup import run_command
+    from mcx_jax.compute.startup import run_command
 
     run_command(main)

@@ -5,7 +5,7 @@ directory checked before anything is computed, so that a mistake is told at once
 """
 
 if __name__ == "__main__":
-    from mcx_jax.command import begin
+    from mcx_jax.console.command import begin
 
     begin()
 
@@ -18,12 +18,16 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from mcx_jax import cli, hosts, machine, streams, tensorboard
 from mcx_jax.assets import policy_file
-from mcx_jax.command import last_words
-from mcx_jax.config import TrainConfig, preset_config
+from mcx_jax.compute import machine, processes
+from mcx_jax.config import command_line
+from mcx_jax.config.training import TrainConfig, preset_config
+from mcx_jax.console import streams
+from mcx_jax.console.command import last_words
 from mcx_jax.errors import UserError
-from mcx_jax.run_dir import (
+from mcx_jax.runs import tensorboard
+from mcx_jax.runs.loop import rest, table_motion, train
+from mcx_jax.runs.run_dir import (
     POLICY,
     RunDir,
     default_path,
@@ -31,10 +35,9 @@ from mcx_jax.run_dir import (
     open_new,
     stored_config,
 )
-from mcx_jax.training import rest, table_motion, train
 
 if TYPE_CHECKING:
-    from mcx_jax.policy import Policy
+    from mcx_jax.policy.file import Policy
 
 FIRST_ORDER_USES = ("hidden", "cell", "lr_decay", "max_grad_norm")
 """Settings of PPO that --algo first-order has, too."""
@@ -79,7 +82,7 @@ class TrainCommand:
         ):
             if not value >= 0:
                 raise UserError(f"{flag} {value}: must be 0 or a positive number")
-        hosts.check(self.distributed)
+        processes.check(self.distributed)
 
 
 def smoke_config(config: TrainConfig) -> TrainConfig:
@@ -127,22 +130,22 @@ def read_command(argv: list[str]) -> tuple[TrainCommand, RunDir]:
     `--resume-from` the stored configuration is the default, and a flag that contradicts it is
     refused.
     """
-    algo = cli.value_of(argv, "--algo") or "ppo"
-    defaults = preset_config(cli.value_of(argv, "--preset") or "fast", algo)
+    algo = command_line.value_of(argv, "--algo") or "ppo"
+    defaults = preset_config(command_line.value_of(argv, "--preset") or "fast", algo)
     if "--smoke" in argv:
         defaults = smoke_config(defaults)
-    parse = functools.partial(cli.parse, TrainCommand, argv, prog="train")
+    parse = functools.partial(command_line.parse, TrainCommand, argv, prog="train")
     command = parse(default=TrainCommand(train=defaults))
     if not command.resume and not command.resume_from:
         _refuse_unused(command.train, defaults)
         _refuse_no_policy(command.train.start_from)
         run = open_new(_directory(command), command.train)
-        run.options = tuple(cli.flags(command, TrainCommand(), STORED))
+        run.options = tuple(command_line.flags(command, TrainCommand(), STORED))
         return command, run
     path = Path(command.run_dir) if command.run_dir else default_path(command.train)
     command = parse(default=TrainCommand(train=stored_config(path)))
     run = open_existing(path, command.train, command.resume_from)
-    run.options = tuple(cli.flags(command, TrainCommand(), STORED))
+    run.options = tuple(command_line.flags(command, TrainCommand(), STORED))
     return command, run
 
 
@@ -162,10 +165,10 @@ def final_table(config: TrainConfig, policy: "Policy", episodes: int, steps: int
         episodes: per sea.
         steps: control steps of an episode, whatever the length in training.
     """
+    from mcx_jax.console.terminal import working
     from mcx_jax.evaluate import evaluate_beside_ik
-    from mcx_jax.policy import PolicyController
-    from mcx_jax.result_table import print_table
-    from mcx_jax.terminal import working
+    from mcx_jax.evaluation.table import print_table
+    from mcx_jax.policy.file import PolicyController
 
     motion = table_motion(config)
     env = replace(config.env, episode_steps=steps)
@@ -192,7 +195,7 @@ def compile_quickly() -> str:
 
 def main(argv: list[str] | None = None) -> None:
     """Command line."""
-    from mcx_jax import startup
+    from mcx_jax.compute import startup
 
     command, run = read_command(list(sys.argv[1:] if argv is None else argv))
     if command.tensorboard:
@@ -214,8 +217,8 @@ def main(argv: list[str] | None = None) -> None:
             events=command.tensorboard,
             checkpoint_interval_s=command.checkpoint_interval_s,
         )
-        hosts.part()
-        if not hosts.first():
+        processes.part()
+        if not processes.first():
             return
         length = (SMOKE_EPISODES, SMOKE_STEPS) if command.smoke else (FINAL_EPISODES, FINAL_STEPS)
         final_table(run.config, policy, *length)
@@ -224,6 +227,6 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    from mcx_jax.startup import run_command
+    from mcx_jax.compute.startup import run_command
 
     run_command(main)

@@ -15,7 +15,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.signal import butter, sosfilt, sosfilt_zi
 from scipy.spatial.transform import Rotation
 
-from mcx_jax.delay import Delay
+from mcx_jax.config.delay import Delay
 
 H_S, SUBSTEPS, KNOT_STEPS, KNOT_S = 0.002, 10, 50, 0.1
 START_RAD = np.array([-0.1, -1.0, 2.4, -2.9, -1.5, 0.0])

@@ -24,9 +24,9 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 try:
-    from mcx_jax.startup import configure
+    from mcx_jax.compute.startup import configure
 except ImportError as error:  # a broken start-up module must fail its own tests, not all of them
-    START_UP = [f"mcx_jax.startup is missing: {error}"]
+    START_UP = [f"mcx_jax.compute.startup is missing: {error}"]
 else:
     # One device, as a library user has it; tests of several start processes of their own.
     START_UP = [*configure(mjx=True, cores=1), f"XLA_FLAGS={os.environ.get('XLA_FLAGS', '')}"]

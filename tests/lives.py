@@ -20,7 +20,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-from mcx_jax import startup
+from mcx_jax.compute import startup
 
 startup.configure("cpu", cores=int(sys.argv[2]) if __name__ == "__main__" else 1)
 
@@ -29,14 +29,14 @@ import numpy as np  # noqa: E402
 import orbax.checkpoint  # noqa: E402, F401
 from probe_envs import make_probe  # noqa: E402
 
-from mcx_jax import checkpoint, divergence  # noqa: E402, F401
-from mcx_jax.config import preset_config  # noqa: E402
-from mcx_jax.env_config import EnvConfig  # noqa: E402
-from mcx_jax.policy import load_policy, named_arrays  # noqa: E402
-from mcx_jax.programs import prepare  # noqa: E402
-from mcx_jax.progress import Progress  # noqa: E402
-from mcx_jax.run_dir import CONFIG, open_existing, open_new  # noqa: E402
-from mcx_jax.training import train  # noqa: E402
+from mcx_jax.config.task import EnvConfig  # noqa: E402
+from mcx_jax.config.training import preset_config  # noqa: E402
+from mcx_jax.policy.file import load_policy, named_arrays  # noqa: E402
+from mcx_jax.runs import checkpoint, divergence  # noqa: E402, F401
+from mcx_jax.runs.loop import train  # noqa: E402
+from mcx_jax.runs.programs import prepare  # noqa: E402
+from mcx_jax.runs.progress import Progress  # noqa: E402
+from mcx_jax.runs.run_dir import CONFIG, open_existing, open_new  # noqa: E402
 
 ITERATIONS = 100
 RUN_CONFIG = replace(

@@ -5,7 +5,7 @@ import functools
 import mujoco
 import numpy as np
 
-from mcx_jax.envs.model import load_mujoco
+from mcx_jax.arm.model import load_mujoco
 
 
 def free_base_model(arm: str | mujoco.MjModel) -> mujoco.MjModel:
@@ -33,8 +33,8 @@ def scratch(m: mujoco.MjModel) -> mujoco.MjData:
 
 def arm_path(name: str) -> str:
     """File of a named arm."""
+    from mcx_jax.arm.model import ARMS
     from mcx_jax.assets import asset_path
-    from mcx_jax.envs.model import ARMS
 
     return str(asset_path(ARMS[name]))
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 os.environ["MCX_JAX_CACHE"] = ""
 os.environ["XLA_FLAGS"] = "--xla_backend_optimization_level=0"
 
-from mcx_jax import startup
+from mcx_jax.compute import startup
 
 if __name__ == "__main__":
     startup.configure("cpu", cores=int(sys.argv[1]))
@@ -25,11 +25,11 @@ from probe_envs import make_probe
 from test_first_order import CONFIG as FIRST_ORDER
 from test_ppo_trainer import CONFIG as PPO
 
-from mcx_jax import checkpoint
-from mcx_jax.controllers import CLASSICAL
-from mcx_jax.env_config import EnvConfig, MotionConfig
+from mcx_jax.config.task import EnvConfig, MotionConfig
+from mcx_jax.controllers.classical import CLASSICAL
 from mcx_jax.evaluate import errors_beside_ik, evaluation_env, rows_beside_ik
-from mcx_jax.programs import prepare
+from mcx_jax.runs import checkpoint
+from mcx_jax.runs.programs import prepare
 
 
 def digest(tree) -> str:

@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from mcx_jax.envs import chain
-from mcx_jax.envs.model import chain_model
+from mcx_jax.arm import chain
+from mcx_jax.arm.model import chain_model
 
 # Both solve the same equations; condition (1e3) times 1e-16 times accelerations of up to 1e3 rad/s2
 # times 2 ms leaves 1e-13; 1e-9 is what the project promises.

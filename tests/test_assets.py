@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from mcx_jax import scene
 from mcx_jax.assets import asset_path
+from mcx_jax.play import scene
 
 H = 0.5**0.5
 PI = np.pi

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mcx_jax.batch_last import batch_last
+from mcx_jax.compute.batch_last import batch_last
 
 # A dozen float32 operations on numbers of 1, in another order at most.
 F32 = 1e-6

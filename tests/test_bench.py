@@ -11,9 +11,9 @@ import pytest
 
 from mcx_jax.bench import __main__ as bench
 from mcx_jax.bench import physics, program, startup_time, timing
-from mcx_jax.config import preset_config
+from mcx_jax.config.training import preset_config
+from mcx_jax.policy.networks import init_carry, init_params, unroll
 from mcx_jax.ppo import trainer
-from mcx_jax.ppo.networks import init_carry, init_params, unroll
 
 CONTRACT = {
     "device",

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from flax import struct
 
-from mcx_jax import checkpoint
 from mcx_jax.errors import UserError
+from mcx_jax.runs import checkpoint
 
 CONFIG = '{\n "seed": 0,\n "seeds": 1\n}\n'
 
@@ -241,11 +241,11 @@ import pickle, sys
 from pathlib import Path
 import jax, jax.numpy as jnp
 from test_checkpoint import _same, _state
-from mcx_jax import checkpoint
+from mcx_jax.runs import checkpoint
 from mcx_jax.errors import UserError
-from mcx_jax.policy import Policy, PolicyMeta, load_policy, save_policy
-from mcx_jax.ppo.networks import init_params
-from mcx_jax.ppo.normalise import init_stats
+from mcx_jax.policy.file import Policy, PolicyMeta, load_policy, save_policy
+from mcx_jax.policy.networks import init_params
+from mcx_jax.policy.normalise import init_stats
 
 run = Path(sys.argv[1])
 checkpoint.save(run, 4, _state(4))

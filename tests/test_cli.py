@@ -9,14 +9,14 @@ from dataclasses import replace
 
 import pytest
 
-from mcx_jax import cli
-from mcx_jax.config import TrainConfig, preset_config
-from mcx_jax.env_config import EnvConfig
+from mcx_jax.config import command_line
+from mcx_jax.config.task import EnvConfig
+from mcx_jax.config.training import TrainConfig, preset_config
 from mcx_jax.errors import UserError
 
 
 def _parse(*argv):
-    return cli.parse(TrainConfig, argv, prog="train", default=preset_config("fast"))
+    return command_line.parse(TrainConfig, argv, prog="train", default=preset_config("fast"))
 
 
 def test_flags_are_flat():
@@ -83,16 +83,16 @@ def test_help_shows_the_defaults_and_ends_well(capsys):
 
 def test_value_of_and_optional_value():
     argv = ["--preset", "fast", "--json", "--preset=paper"]
-    assert cli.value_of(argv, "--preset") == "paper"
-    assert cli.value_of(argv, "--seed") is None
-    assert cli.optional_value(argv, "--json", "-")[2] == "--json=-"
-    assert cli.optional_value(["--json", "a.json"], "--json", "-") == ["--json", "a.json"]
-    assert cli.optional_value(["--json"], "--json", "-") == ["--json=-"]
+    assert command_line.value_of(argv, "--preset") == "paper"
+    assert command_line.value_of(argv, "--seed") is None
+    assert command_line.optional_value(argv, "--json", "-")[2] == "--json=-"
+    assert command_line.optional_value(["--json", "a.json"], "--json", "-") == ["--json", "a.json"]
+    assert command_line.optional_value(["--json"], "--json", "-") == ["--json=-"]
 
 
 def test_configuration_survives_json():
     config = replace(preset_config("paper"), seed=3, env=EnvConfig(delay="butter:4:7.5Hz"))
-    assert cli.config_from_json(TrainConfig, cli.config_to_json(config)) == config
+    assert command_line.config_from_json(TrainConfig, command_line.config_to_json(config)) == config
 
 
 @pytest.mark.parametrize(
@@ -114,30 +114,30 @@ def test_configuration_survives_json():
     ],
 )
 def test_strange_configuration_files(change, message):
-    values = json.loads(cli.config_to_json(preset_config("fast")))
+    values = json.loads(command_line.config_to_json(preset_config("fast")))
     values = {k: v for k, v in {**values, **change}.items() if v is not None}
     with pytest.raises(UserError) as error:
-        cli.config_from_json(TrainConfig, json.dumps(values))
+        command_line.config_from_json(TrainConfig, json.dumps(values))
     assert str(error.value) == message
 
 
 def test_a_setting_added_later_has_its_default_in_older_files():
-    values = json.loads(cli.config_to_json(preset_config("fast")))
+    values = json.loads(command_line.config_to_json(preset_config("fast")))
     del values["start_from"]
-    assert cli.config_from_json(TrainConfig, json.dumps(values)) == preset_config("fast")
+    assert command_line.config_from_json(TrainConfig, json.dumps(values)) == preset_config("fast")
 
 
 def test_cut_short_configuration_file():
-    text = cli.config_to_json(preset_config("fast"))
+    text = command_line.config_to_json(preset_config("fast"))
     with pytest.raises(UserError, match="config.json: not a JSON file, or cut short"):
-        cli.config_from_json(TrainConfig, text[:40])
+        command_line.config_from_json(TrainConfig, text[:40])
 
 
 def test_difference_names_the_flag():
     config = preset_config("fast")
-    assert cli.difference(config, config) is None
+    assert command_line.difference(config, config) is None
     other = replace(config, env=replace(config.env, delay="E1"))
-    assert cli.difference(config, other) == "--delay B4_4, not E1"
+    assert command_line.difference(config, other) == "--delay B4_4, not E1"
 
 
 OUTPUTS = {
@@ -169,9 +169,10 @@ def test_empty_files_and_devices_are_written_to(tmp_path):
     (tmp_path / "empty").write_text("")
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "empty", tmp_path / "pipe", "/dev/null", tmp_path / "new"):
-        cli.check_output("--json", str(path))
+        command_line.check_output("--json", str(path))
 
 
 def test_parsing_needs_no_jax():
-    code = "import sys, mcx_jax.cli, mcx_jax.config; sys.exit('jax' in sys.modules)"
+    modules = "mcx_jax.config.command_line, mcx_jax.config.training"
+    code = f"import sys, {modules}; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

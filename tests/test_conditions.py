@@ -9,11 +9,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig, Range
-from mcx_jax.envs import chain, conditions
+from mcx_jax.arm import chain
+from mcx_jax.arm.model import chain_model
+from mcx_jax.arm.plant import Plant
+from mcx_jax.config.task import ConditionsConfig, EnvConfig, MotionConfig, Range
+from mcx_jax.envs import conditions
 from mcx_jax.envs.goal_path import PERIOD_S, RADIUS_M, load_goal_path
-from mcx_jax.envs.model import chain_model
-from mcx_jax.envs.plant import Plant
 from mcx_jax.envs.v2v import make_env
 from mcx_jax.errors import UserError
 

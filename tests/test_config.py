@@ -15,8 +15,7 @@ import pytest
 from scipy.signal import butter, group_delay
 
 import mcx_jax
-from mcx_jax.config import FirstOrderConfig, PPOConfig, TrainConfig, preset_config
-from mcx_jax.delay import (
+from mcx_jax.config.delay import (
     CONTROL_DT_S,
     NAMED_DELAYS,
     NYQUIST_HZ,
@@ -25,7 +24,8 @@ from mcx_jax.delay import (
     Delay,
     parse_delay,
 )
-from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
+from mcx_jax.config.task import ConditionsConfig, EnvConfig, MotionConfig
+from mcx_jax.config.training import FirstOrderConfig, PPOConfig, TrainConfig, preset_config
 from mcx_jax.errors import UserError
 
 KNOWN = (

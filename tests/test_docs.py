@@ -19,9 +19,9 @@ import browser
 import pytest
 
 import mcx_jax
-from mcx_jax import cli
 from mcx_jax.bench.__main__ import BenchConfig
-from mcx_jax.config import preset_config
+from mcx_jax.config import command_line
+from mcx_jax.config.training import preset_config
 from mcx_jax.errors import UserError
 from mcx_jax.evaluate import EvaluateConfig
 from mcx_jax.export import ExportConfig
@@ -85,14 +85,14 @@ def parse(module, words):
     if "--help" in words or module == "sea":
         assert set(words) <= OTHER_FLAGS, words
         return
-    words = cli.optional_value(words, "--json", "-")
+    words = command_line.optional_value(words, "--json", "-")
     if module != "train":
-        cli.parse(CONFIGS[module], words, prog=module)
+        command_line.parse(CONFIGS[module], words, prog=module)
         return
-    algo = cli.value_of(words, "--algo") or "ppo"
-    config = preset_config(cli.value_of(words, "--preset") or "fast", algo)
+    algo = command_line.value_of(words, "--algo") or "ppo"
+    config = preset_config(command_line.value_of(words, "--preset") or "fast", algo)
     config = smoke_config(config) if "--smoke" in words else config
-    cli.parse(TrainCommand, words, prog=module, default=TrainCommand(train=config))
+    command_line.parse(TrainCommand, words, prog=module, default=TrainCommand(train=config))
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +119,7 @@ def test_the_site_fetches_nothing(site, pages):
         loaded = re.findall(r"<(?:script|link|img|source|iframe)\b[^>]*(?:https?:)?//[^>]*>", html)
         assert not loaded, (page, loaded)
     shown = (site / "api" / "task.html").read_text()
-    assert 'id="mcx_jax.envs.lag.apply"' in shown
+    assert 'id="mcx_jax.arm.lag.apply"' in shown
     assert "joint reference, rad" in shown  # units come with the arguments
     assert not list(site.rglob("*.py"))
 
@@ -319,7 +319,7 @@ def said_here(command, monkeypatch, capsys):
 
 
 def test_refusals_of_arms_are_all_told(pages):
-    from mcx_jax.envs.fields import REFUSED
+    from mcx_jax.arm.fields import REFUSED
 
     told = pages["own-arm.md"].replace("`", "")
     for refusal in REFUSED:
@@ -327,7 +327,7 @@ def test_refusals_of_arms_are_all_told(pages):
 
 
 def test_the_example_arm_is_taken(docs):
-    from mcx_jax.envs.model import chain_model, load_mujoco
+    from mcx_jax.arm.model import chain_model, load_mujoco
 
     model = chain_model(load_mujoco(str(docs / "seven.xml")), "gripper")
     assert model.nq == 7 and model.integrator == "implicitfast"

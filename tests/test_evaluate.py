@@ -9,12 +9,12 @@ import sys
 import numpy as np
 import pytest
 
-from mcx_jax.controllers import CLASSICAL
-from mcx_jax.env_config import EnvConfig, MotionConfig
+from mcx_jax.config.task import EnvConfig, MotionConfig
+from mcx_jax.controllers.by_name import load_controller
+from mcx_jax.controllers.classical import CLASSICAL
 from mcx_jax.errors import UserError
 from mcx_jax.evaluate import EvaluateConfig, evaluate
-from mcx_jax.results import GROUPS, WARM_UP_STEPS
-from mcx_jax.roster import load_controller
+from mcx_jax.evaluation.statistics import GROUPS, WARM_UP_STEPS
 
 # 20 steps count after the first second; implicitfast, so that rounding grows little.
 SHORT = EnvConfig(delay="E2", integrator="implicitfast", episode_steps=70)
@@ -147,8 +147,8 @@ def test_episodes_without_a_rate_after_the_warm_up_are_refused():
 
 
 def test_shipped_policies_are_there_for_the_papers_delays():
-    from mcx_jax.delay import NAMED_DELAYS
-    from mcx_jax.policy import load_run
+    from mcx_jax.config.delay import NAMED_DELAYS
+    from mcx_jax.policy.file import load_run
 
     for delay in NAMED_DELAYS:
         name, controller = load_controller(f"shipped:{delay}")

@@ -18,16 +18,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mcx_jax import cli, extras, numpy_policy
-from mcx_jax.config import TrainConfig
-from mcx_jax.env_config import EnvConfig, MotionConfig
+from mcx_jax import extras
+from mcx_jax.config import command_line
+from mcx_jax.config.task import EnvConfig, MotionConfig
+from mcx_jax.config.training import TrainConfig
 from mcx_jax.envs import observe
 from mcx_jax.envs.motion import draw_track
 from mcx_jax.envs.v2v import correct, make_env
 from mcx_jax.envs.vessels import draw_goal
-from mcx_jax.episodes import run_episodes
+from mcx_jax.evaluation.episodes import run_episodes
+from mcx_jax.evaluation.statistics import WARM_UP_STEPS
 from mcx_jax.export import main
-from mcx_jax.policy import (
+from mcx_jax.policy import numpy_policy
+from mcx_jax.policy.file import (
     Policy,
     PolicyController,
     PolicyMeta,
@@ -36,9 +39,8 @@ from mcx_jax.policy import (
     load_policy,
     save_policy,
 )
-from mcx_jax.ppo.networks import init_params
-from mcx_jax.ppo.normalise import RunningStats
-from mcx_jax.results import WARM_UP_STEPS
+from mcx_jax.policy.networks import init_params
+from mcx_jax.policy.normalise import RunningStats
 from mcx_jax.spatial import unpack, unpack_matrix
 
 HIDDEN, STEPS, ROWS = 16, 50, 3
@@ -68,7 +70,7 @@ def steering_params(net):
 
 @pytest.fixture(scope="module")
 def policy():
-    config = cli.config_to_json(TrainConfig(env=EnvConfig(delay="E1", episode_steps=1024)))
+    config = command_line.config_to_json(TrainConfig(env=EnvConfig(delay="E1", episode_steps=1024)))
     meta = PolicyMeta(obs_size=observe.OBS_SIZE, action_size=6, hidden=HIDDEN, config=config)
     stats = RunningStats(jnp.ones(()), jnp.float32(MEAN), jnp.float32(STD**2))
     return Policy(steering_params(meta.net), stats, meta)

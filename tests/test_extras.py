@@ -46,10 +46,10 @@ def test_what_is_missing_is_one_line(monkeypatch):
 
 
 def test_mcx_jax_gym_names_the_extra():
-    code = "import sys; sys.modules['gymnasium'] = None; import mcx_jax.gym"
+    code = "import sys; sys.modules['gymnasium'] = None; import mcx_jax.integrations.gym"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     last = done.stderr.splitlines()[-1]
-    wanted = f"mcx_jax.gym needs gymnasium: {extras.install('gym')}"
+    wanted = f"mcx_jax.integrations.gym needs gymnasium: {extras.install('gym')}"
     assert last == f"ModuleNotFoundError: {wanted}"
 
 
@@ -112,7 +112,7 @@ def python_with(repo_root, tmp_path):
 
 TINY = ("--episodes", "2", "--episode-steps", "60")
 GYM = """
-import gymnasium, mcx_jax.gym
+import gymnasium, mcx_jax.integrations.gym
 env = gymnasium.make("mcx_jax/V2V-v0", delay="E1")
 env.reset(seed=0)
 print(env.step(env.action_space.sample())[1])

@@ -13,15 +13,15 @@ from probe_envs import ProbeEnv, make_probe
 from test_first_order import CONFIG as FIRST_ORDER
 from test_ppo_trainer import CONFIG as PPO
 
-from mcx_jax import checkpoint, divergence
-from mcx_jax.config import TrainConfig
-from mcx_jax.env_config import EnvConfig
+from mcx_jax.compute.sharding import env_mesh
+from mcx_jax.config.task import EnvConfig
+from mcx_jax.config.training import TrainConfig
 from mcx_jax.errors import UserError
 from mcx_jax.ppo.rollout import replace_broken
-from mcx_jax.programs import Training, prepare
-from mcx_jax.run_dir import open_existing, open_new
-from mcx_jax.sharding import env_mesh
-from mcx_jax.training import train
+from mcx_jax.runs import checkpoint, divergence
+from mcx_jax.runs.loop import train
+from mcx_jax.runs.programs import Training, prepare
+from mcx_jax.runs.run_dir import open_existing, open_new
 
 # Two blocks of environments in both: environment 5 is not the one renewed first.
 FIRST_ORDER = replace(FIRST_ORDER, env=EnvConfig(episode_steps=32))

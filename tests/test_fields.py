@@ -18,11 +18,11 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
-from mcx_jax.envs import chain, dynamics, fields, mjx_engine
-from mcx_jax.envs.model import chain_model
+from mcx_jax.arm import chain, dynamics, fields, mjx_engine
+from mcx_jax.arm.model import chain_model
 from mcx_jax.errors import UserError
-from mcx_jax.mjx_model import read
-from mcx_jax.mjx_step import put_model
+from mcx_jax.integrations.mjx_model import read
+from mcx_jax.integrations.mjx_step import put_model
 
 PARTS = {
     "read": fields.READ,
@@ -151,7 +151,7 @@ def chain_steps(monkeypatch):
 def test_a_field_that_mujoco_brings_anew_is_in_no_part_of_the_table(arm):
     here = set(fields.fields_of(arm))
     known = set().union(*ROLES.values())
-    assert here - known == set(), "new in this MuJoCo: put it in mcx_jax/envs/fields.py"
+    assert here - known == set(), "new in this MuJoCo: put it in mcx_jax/arm/fields.py"
     assert known - here == set(), "gone from this MuJoCo"
 
 
@@ -317,7 +317,9 @@ FLAGS = {"actuator_biastype", "actuator_ctrllimited", "actuator_forcelimited", "
 
 def test_armature_that_mjx_dropped_is_refused_where_it_can_be_seen(arm_without_sensors):
     delayed = XML.replace("<motor", '<motor delay=".04" nsample="9"')
-    with pytest.raises(UserError, match="put the model with mcx_jax.mjx_step.put_model"):
+    with pytest.raises(
+        UserError, match="put the model with mcx_jax.integrations.mjx_step.put_model"
+    ):
         read(mjx.put_model(arm_without_sensors))
     with pytest.raises(UserError, match="delayed actuators or sensors"):
         read(mjx.put_model(mujoco.MjModel.from_xml_string(delayed)))

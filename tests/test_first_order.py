@@ -9,12 +9,12 @@ import pytest
 from flax import struct
 from probe_envs import ProbeEnv, make_probe
 
-from mcx_jax.config import FirstOrderConfig, TrainConfig, preset_config
-from mcx_jax.env_config import EnvConfig
+from mcx_jax.compute.sharding import env_mesh
+from mcx_jax.config.task import EnvConfig
+from mcx_jax.config.training import FirstOrderConfig, TrainConfig, preset_config
 from mcx_jax.errors import UserError
 from mcx_jax.first_order import trainer
-from mcx_jax.programs import prepare
-from mcx_jax.sharding import env_mesh
+from mcx_jax.runs.programs import prepare
 
 CONFIG = replace(
     preset_config("fast", "first-order"),

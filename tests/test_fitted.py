@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcx_jax import fitted
-from mcx_jax.controllers import Extrapolate, Preview
-from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
+from mcx_jax.config.task import ConditionsConfig, EnvConfig, MotionConfig
+from mcx_jax.controllers import fitted
+from mcx_jax.controllers.classical import Extrapolate, Preview
 from mcx_jax.envs.conditions import Conditions, Measurement
 from mcx_jax.envs.v2v import make_env
 from mcx_jax.errors import UserError

@@ -20,22 +20,25 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from mcx_jax import checkpoint, cli, evaluate, export, extras, startup, train
+from mcx_jax import evaluate, export, extras, train
+from mcx_jax.arm.load import load_arm
+from mcx_jax.arm.model import ARMS, load_mujoco
 from mcx_jax.bench import __main__ as bench_command
-from mcx_jax.config import TrainConfig, preset_config
-from mcx_jax.delay import parse_delay
-from mcx_jax.env_config import EnvConfig, parse_range
-from mcx_jax.envs.arm import load_arm
+from mcx_jax.compute import startup
+from mcx_jax.config import command_line
+from mcx_jax.config.delay import parse_delay
+from mcx_jax.config.task import EnvConfig, parse_range
+from mcx_jax.config.training import TrainConfig, preset_config
 from mcx_jax.envs.goal_path import load_goal_path
-from mcx_jax.envs.model import ARMS, load_mujoco
 from mcx_jax.errors import UserError
 from mcx_jax.play import __main__ as play_command
-from mcx_jax.policy import Policy, PolicyMeta, load_policy, npz_bytes
-from mcx_jax.ppo.networks import init_params
-from mcx_jax.ppo.normalise import init_stats
+from mcx_jax.policy.file import Policy, PolicyMeta, load_policy, npz_bytes
+from mcx_jax.policy.networks import init_params
+from mcx_jax.policy.normalise import init_stats
 from mcx_jax.report import __main__ as report_command
 from mcx_jax.report.entries import learning_curves
-from mcx_jax.run_dir import METRICS, _cut_metrics, stored_config
+from mcx_jax.runs import checkpoint
+from mcx_jax.runs.run_dir import METRICS, _cut_metrics, stored_config
 from mcx_jax.sea import __main__ as sea_command
 from mcx_jax.sea.recording import load_recording
 from mcx_jax.sea.spectrum import parse_sea
@@ -464,7 +467,7 @@ def test_arm_files(content, place):
 
 # --- what a run directory holds ---
 
-CONFIG = json.loads(cli.config_to_json(preset_config("fast")))
+CONFIG = json.loads(command_line.config_to_json(preset_config("fast")))
 
 
 @cases(300)
@@ -487,7 +490,7 @@ def test_config_files(content, place):
     write(run / "config.json", content)
     config = sober(stored_config, run, where=place)
     if config:
-        again = cli.config_from_json(TrainConfig, cli.config_to_json(config))
+        again = command_line.config_from_json(TrainConfig, command_line.config_to_json(config))
         assert again == config
         assert 0 <= config.seed <= config.seed + config.seeds < 2**31 + 1
 

@@ -17,10 +17,10 @@ from gymnasium import wrappers
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
-from mcx_jax import gym
-from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
+from mcx_jax.config.task import ConditionsConfig, EnvConfig, MotionConfig
 from mcx_jax.envs.v2v import make_env
 from mcx_jax.errors import UserError
+from mcx_jax.integrations import gym
 
 STEPS = 12
 # implicitfast chatters less: rounding is not amplified as much as by Euler.

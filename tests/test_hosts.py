@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcx_jax import hosts
+from mcx_jax.compute import processes
+from mcx_jax.compute.heartbeat import Heartbeat
+from mcx_jax.compute.sharding import env_mesh
 from mcx_jax.errors import UserError
-from mcx_jax.heartbeat import Heartbeat
-from mcx_jax.sharding import env_mesh
 
 ITERATIONS = 100
 LIMIT_S = 300
@@ -139,9 +139,9 @@ def test_two_processes(repo_root, place, pair):
 )
 def test_places_that_cannot_be_meant(text):
     with pytest.raises(UserError, match="must be auto .* or HOST:PORT,I/N"):
-        hosts.check(text)
+        processes.check(text)
     for good in ("", "auto", "node-1.cluster:1234,0/2", "[::1]:1234,7/8"):
-        hosts.check(good)
+        processes.check(good)
 
 
 def test_a_partner_that_never_comes():
@@ -149,9 +149,9 @@ def test_a_partner_that_never_comes():
         free.bind(("127.0.0.1", 0))
         place = f"127.0.0.1:{free.getsockname()[1]}"
     with pytest.raises(OSError, match="1 of 2 are missing after 0.3 s"):
-        hosts.meet(place, 2, 0, 0.3)
+        processes.meet(place, 2, 0, 0.3)
     with pytest.raises(OSError, match=f"nobody listens at {place} after 0.3 s"):
-        hosts.meet(place, 2, 1, 0.3)
+        processes.meet(place, 2, 1, 0.3)
 
 
 def test_partners_that_come_late():
@@ -159,9 +159,9 @@ def test_partners_that_come_late():
         free.bind(("127.0.0.1", 0))
         place = f"127.0.0.1:{free.getsockname()[1]}"
     with ThreadPoolExecutor(3) as pool, contextlib.ExitStack() as stack:
-        others = [pool.submit(hosts.meet, place, 3, i, 20.0) for i in (1, 2)]
+        others = [pool.submit(processes.meet, place, 3, i, 20.0) for i in (1, 2)]
         time.sleep(0.5)
-        met = hosts.meet(place, 3, 0, 20.0)
+        met = processes.meet(place, 3, 0, 20.0)
         assert set(met) == {1, 2}
         for index, other in zip((1, 2), others, strict=True):
             (to_first,) = other.result().values()
@@ -241,8 +241,8 @@ def test_devices_of_several_processes_must_share_evenly():
 
 
 def test_one_process_agrees_with_itself():
-    assert hosts.first() and hosts.alone()
-    assert hosts.agree(3, 0) == (3, 0)
-    found = hosts.whole({"a": jnp.arange(3)})
+    assert processes.first() and processes.alone()
+    assert processes.agree(3, 0) == (3, 0)
+    found = processes.whole({"a": jnp.arange(3)})
     assert type(found["a"]) is np.ndarray and list(found["a"]) == [0, 1, 2]
-    hosts.part()
+    processes.part()

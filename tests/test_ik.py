@@ -12,9 +12,10 @@ from dm_control.utils.inverse_kinematics import qpos_from_site_pose
 from moving_base import arm_path
 from scipy.spatial.transform import Rotation
 
-from mcx_jax.envs import ik, vessels
-from mcx_jax.envs.arm import START_POSE_RAD
-from mcx_jax.envs.model import chain_model, load_mujoco
+from mcx_jax.arm import ik
+from mcx_jax.arm.load import START_POSE_RAD
+from mcx_jax.arm.model import chain_model, load_mujoco
+from mcx_jax.envs import vessels
 from mcx_jax.spatial import exp_rotation, matmul, unpack, unpack_matrix, vadd
 
 START = np.array(START_POSE_RAD)

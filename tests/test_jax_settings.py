@@ -9,9 +9,9 @@ import jax.experimental.pallas  # which defines some more options
 import jax.numpy as jnp
 import pytest
 
-from mcx_jax import jax_settings, startup
+from mcx_jax.compute import jax_settings, startup
+from mcx_jax.compute.jax_settings import LEFT, OURS, REFUSED, clean, names
 from mcx_jax.errors import UserError
-from mcx_jax.jax_settings import LEFT, OURS, REFUSED, clean, names
 
 KNOWN = startup.known_flags("0.10.2")
 
@@ -100,7 +100,7 @@ WHERE = {
 def test_a_setting_that_jax_cannot_follow_is_one_line(name, tmp_path):
     value, said = WHERE[name]
     variables = {**os.environ, "JAX_PLATFORMS": "", name: value, "MCX_JAX_CACHE": ""}
-    code = "from mcx_jax import startup; startup.run_command(startup.configure)"
+    code = "from mcx_jax.compute import startup; startup.run_command(startup.configure)"
     done = subprocess.run(
         [sys.executable, "-c", code], env=variables, capture_output=True, text=True, check=False
     )
@@ -112,7 +112,7 @@ def test_a_users_settings_do_not_reach_the_numbers():
     """The samples of the fault; what this process, without them, computes is right."""
     x = jax.random.normal(jax.random.key(0), (3, 1)) + jnp.ones(3)
     code = (
-        "from mcx_jax import startup; startup.configure('cpu', cores=1)\n"
+        "from mcx_jax.compute import startup; startup.configure('cpu', cores=1)\n"
         "import jax, jax.numpy as jnp\n"
         "x = jax.random.normal(jax.random.key(0), (3, 1)) + jnp.ones(3)\n"
         "print(x.dtype, x.tolist())"

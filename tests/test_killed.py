@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 from test_train_command import CONFIG, _contents, _make_env
 
-from mcx_jax import checkpoint, startup
+from mcx_jax.compute import startup
 from mcx_jax.errors import UserError
-from mcx_jax.run_dir import RunDir, open_existing, open_new
-from mcx_jax.training import train
+from mcx_jax.runs import checkpoint
+from mcx_jax.runs.loop import train
+from mcx_jax.runs.run_dir import RunDir, open_existing, open_new
 
 
 @pytest.fixture(scope="module")
@@ -148,9 +149,9 @@ def test_disk_full_while_training(what, tmp_path, monkeypatch, capsys):
             append(self, rows)
 
         if what == "create":
-            patch.setattr("mcx_jax.run_dir._write_whole", fails)
+            patch.setattr("mcx_jax.runs.run_dir._write_whole", fails)
         elif what == "policy":
-            patch.setattr("mcx_jax.policy.write_whole", fails)
+            patch.setattr("mcx_jax.policy.file.write_whole", fails)
         else:
             patch.setattr(RunDir, "append", append_until)
         with pytest.raises(SystemExit) as stop:

@@ -12,8 +12,8 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from scipy.signal import butter, sosfilt, sosfilt_zi
 
-from mcx_jax.delay import CONTROL_DT_S, NYQUIST_HZ, Delay, parse_delay
-from mcx_jax.envs import lag
+from mcx_jax.arm import lag
+from mcx_jax.config.delay import CONTROL_DT_S, NYQUIST_HZ, Delay, parse_delay
 
 JOINTS = 6
 # Every shrinking step would compile another filter: minutes before a failure is shown.

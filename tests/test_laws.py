@@ -13,12 +13,13 @@ import pytest
 from scipy.signal import butter, sosfilt, sosfilt_zi
 from scipy.spatial.transform import Rotation
 
-from mcx_jax.delay import MAX_DELAY_S, NYQUIST_HZ, Delay
-from mcx_jax.envs import chain, dynamics, ik, lag, vessels
-from mcx_jax.envs.arm import START_POSE_RAD
-from mcx_jax.envs.model import chain_model, load_mujoco
+from mcx_jax.arm import chain, dynamics, ik, lag
+from mcx_jax.arm.load import START_POSE_RAD
+from mcx_jax.arm.model import chain_model, load_mujoco
+from mcx_jax.config.delay import MAX_DELAY_S, NYQUIST_HZ, Delay
+from mcx_jax.envs import vessels
+from mcx_jax.envs.sampler import KNOT_STEPS
 from mcx_jax.envs.vessels import Segment
-from mcx_jax.sea.sampler import KNOT_STEPS
 from mcx_jax.spatial import matmul, matvec, unpack, unpack_matrix
 
 NAMES = ("paper", *arms.ARMS)

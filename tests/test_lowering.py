@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 from jax.sharding import AbstractMesh
 
-from mcx_jax import programs
-from mcx_jax.config import preset_config
-from mcx_jax.env_config import MotionConfig
+from mcx_jax.compute.sharding import ENV_AXIS
+from mcx_jax.config.task import MotionConfig
+from mcx_jax.config.training import preset_config
 from mcx_jax.envs.v2v import make_env
 from mcx_jax.ppo.rollout import step_all
-from mcx_jax.sharding import ENV_AXIS
+from mcx_jax.runs import programs
 from mcx_jax.train import smoke_config
 
 PLATFORMS = ("cuda", "tpu")

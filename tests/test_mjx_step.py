@@ -1,4 +1,4 @@
-"""`mcx_jax.mjx_step.step` in programs written for `mjx.step`."""
+"""`mcx_jax.integrations.mjx_step.step` in programs written for `mjx.step`."""
 
 import functools
 
@@ -11,7 +11,7 @@ import pytest
 from mujoco import mjx
 
 from mcx_jax.errors import UserError
-from mcx_jax.mjx_step import step
+from mcx_jax.integrations.mjx_step import step
 
 ROWS, STEPS = 8, 25
 # float64, one step: two orders of summing the same terms, as in test_arms.

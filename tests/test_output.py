@@ -15,9 +15,9 @@ import sys
 import pytest
 
 import mcx_jax
-from mcx_jax import command
-from mcx_jax.startup import run_command
-from mcx_jax.streams import CLOSED, Guarded
+from mcx_jax.compute.startup import run_command
+from mcx_jax.console import command
+from mcx_jax.console.streams import CLOSED, Guarded
 
 
 def _closed_pipe():
@@ -50,7 +50,7 @@ KINDS = pytest.mark.parametrize(("kind", "why"), list(zip(LOST, REASONS, strict=
 WRITES_IN_EVERY_WAY = """
 import logging, sys, warnings
 from pathlib import Path
-from mcx_jax import streams
+from mcx_jax.console import streams
 streams.guard()
 free = open(sys.argv[1])
 assert free.fileno() > 2, "a file got the number of a closed stream"
@@ -173,7 +173,8 @@ def test_ctrl_c_during_the_imports(module, tmp_path):
 
 
 def test_every_command_takes_ctrl_c_before_its_imports(repo_root):
-    begin = 'if __name__ == "__main__":\n    from mcx_jax.command import begin\n\n    begin()\n\n'
+    begin = "    from mcx_jax.console.command import begin\n\n    begin()\n\n"
+    begin = f'if __name__ == "__main__":\n{begin}'
     found = 0
     for module in pkgutil.walk_packages(mcx_jax.__path__, "mcx_jax."):
         path = repo_root / (module.name.replace(".", "/") + ".py")
@@ -187,7 +188,7 @@ def test_every_command_takes_ctrl_c_before_its_imports(repo_root):
 
 ENDS = """
 import os, signal, sys, time
-from mcx_jax import command
+from mcx_jax.console import command
 command.begin()
 with command.last_words(lambda: "so far: 3"):
     try:

@@ -153,7 +153,7 @@ def test_python_m_mcx_jax_lists_every_command(repo_root, tracked, capsys):
     names = {str(p).removesuffix("/__main__.py").removesuffix(".py") for p in runs}
     commands.main([])
     said = capsys.readouterr().out
-    assert names - {"__main__", "startup"} == set(commands.COMMANDS)
+    assert names - {"__main__", "compute/startup"} == set(commands.COMMANDS)
     for name, sentence in commands.COMMANDS.items():
         assert sentence.endswith(".") and f"  mcx {name} " in said
     assert max(map(len, said.splitlines())) <= 80
@@ -272,7 +272,8 @@ def test_wheel_holds_the_assets_and_finds_them(repo_root, tracked, tmp_path):
     assert not (unpacked / "tests").exists()
     # As installed: another folder, and the package found there, not in the source tree.
     code = (
-        "from mcx_jax import assets, scene; path = assets.asset_path('ur10e_paper.xml'); "
+        "from mcx_jax import assets; from mcx_jax.play import scene; "
+        "path = assets.asset_path('ur10e_paper.xml'); "
         "print(path, scene.build_scene().nu)"
     )
     environment = {**os.environ, "PYTHONPATH": str(unpacked)}

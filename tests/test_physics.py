@@ -18,10 +18,10 @@ import pytest
 from jax import lax
 from scipy.spatial.transform import Rotation
 
-from mcx_jax.envs import chain, mjx_engine
-from mcx_jax.envs.arm import START_POSE_RAD
-from mcx_jax.envs.model import chain_model, load_mujoco
-from mcx_jax.envs.plant import Plant
+from mcx_jax.arm import chain, mjx_engine
+from mcx_jax.arm.load import START_POSE_RAD
+from mcx_jax.arm.model import chain_model, load_mujoco
+from mcx_jax.arm.plant import Plant
 from mcx_jax.errors import UserError
 from mcx_jax.spatial import unpack
 

@@ -19,10 +19,11 @@ import pytest
 from browser import off_screen_opengl, tab
 
 from mcx_jax import extras
-from mcx_jax.controllers import CLASSICAL
-from mcx_jax.delay import CONTROL_DT_S, SUBSTEPS
-from mcx_jax.env_config import EnvConfig, MotionConfig
-from mcx_jax.envs import ik, vessels
+from mcx_jax.arm import ik
+from mcx_jax.config.delay import CONTROL_DT_S, SUBSTEPS
+from mcx_jax.config.task import EnvConfig, MotionConfig
+from mcx_jax.controllers.classical import CLASSICAL
+from mcx_jax.envs import vessels
 from mcx_jax.envs.motion import Track
 from mcx_jax.envs.v2v import make_env
 from mcx_jax.errors import UserError
@@ -30,10 +31,10 @@ from mcx_jax.evaluate import errors_beside_ik
 from mcx_jax.play import gl
 from mcx_jax.play.__main__ import PlayConfig, main
 from mcx_jax.play.episode import EPISODES, describe_sea, simulate
-from mcx_jax.play.stage import Painter, Stage
+from mcx_jax.play.renderer import Painter, Stage
+from mcx_jax.play.scene import FREEBOARD_M, below_decks_m
 from mcx_jax.play.video import STRIDE, title
 from mcx_jax.play.waves import surface
-from mcx_jax.scene import FREEBOARD_M, below_decks_m
 from mcx_jax.sea.hydro import VesselKnobs
 from mcx_jax.sea.spectrum import GRAVITY_M_S2, parse_sea
 from mcx_jax.sea.tables import component_grid, inverse_fft, table_seed, wave_amplitudes
@@ -315,9 +316,9 @@ def test_page_answers_and_builds_the_scene(player):
 
 def test_the_menu_is_evaluates():
     """Names of `evaluate`, every shipped policy, and each of them loads."""
+    from mcx_jax.controllers.by_name import FITTED, WHO
     from mcx_jax.play.player import Menu
     from mcx_jax.report.entries import load_entries
-    from mcx_jax.roster import FITTED, WHO
 
     menu = Menu(PlayConfig(who="ik", env=TASK), *load_entries(["ik"]))
     assert set(WHO) < set(menu.names)
@@ -520,7 +521,7 @@ def test_ctrl_c_ends_cleanly(repo_root):
 
 
 def test_sea_of_the_model_is_the_surface(take):
-    from mcx_jax.scene import sea_points_m, water_level_m
+    from mcx_jax.play.scene import sea_points_m, water_level_m
 
     stage = Stage(TASK)
     made = surface(take, MOTION, take.time_s[:1])

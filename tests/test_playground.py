@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcx_jax.env_config import EnvConfig, MotionConfig
-from mcx_jax.playground import V2V, State
+from mcx_jax.config.task import EnvConfig, MotionConfig
+from mcx_jax.integrations.playground import V2V, State
 
 STEPS = 10
 MANY = 3

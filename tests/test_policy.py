@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mcx_jax.controllers.by_name import load_controller
 from mcx_jax.errors import UserError
-from mcx_jax.policy import (
+from mcx_jax.policy.file import (
     LARGEST,
     Policy,
     PolicyController,
@@ -19,9 +20,8 @@ from mcx_jax.policy import (
     require_task,
     save_policy,
 )
-from mcx_jax.ppo.networks import init_params
-from mcx_jax.ppo.normalise import RunningStats
-from mcx_jax.roster import load_controller
+from mcx_jax.policy.networks import init_params
+from mcx_jax.policy.normalise import RunningStats
 
 
 @pytest.fixture(scope="module")

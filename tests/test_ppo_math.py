@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcx_jax.ppo import normalise as nm
+from mcx_jax.policy import normalise as nm
+from mcx_jax.policy.gaussian import action_distribution
 from mcx_jax.ppo.gae import discounted_returns, gae
-from mcx_jax.ppo.gaussian import action_distribution
 from mcx_jax.ppo.loss import (
     clipped_surrogate,
     explained_variance,

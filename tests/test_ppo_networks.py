@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcx_jax.ppo import dense, gru, lstm
-from mcx_jax.ppo import networks as nw
+from mcx_jax.policy import dense, gru, lstm
+from mcx_jax.policy import networks as nw
 
 HIDDEN, OBS, ACTIONS, TIME, BATCH = 16, 5, 3, 7, 4
 

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from probe_envs import make_probe
 
-from mcx_jax.config import PPOConfig, TrainConfig
-from mcx_jax.env_config import EnvConfig
+from mcx_jax.compute.sharding import env_mesh
+from mcx_jax.config.task import EnvConfig
+from mcx_jax.config.training import PPOConfig, TrainConfig
+from mcx_jax.policy.networks import init_carry, init_params, step
+from mcx_jax.policy.normalise import RunningStats, denormalise
 from mcx_jax.ppo import trainer
-from mcx_jax.ppo.networks import init_carry, init_params, step
-from mcx_jax.ppo.normalise import RunningStats, denormalise
 from mcx_jax.ppo.rollout import init_actors, insert_block, reset_all
 from mcx_jax.ppo.update import gradient_step, init_fitted
-from mcx_jax.programs import prepare, reset
-from mcx_jax.sharding import env_mesh
+from mcx_jax.runs.programs import prepare, reset
 
 CONFIG = TrainConfig(
     num_envs=64,

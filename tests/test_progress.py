@@ -12,14 +12,15 @@ import pytest
 from probe_envs import make_probe
 from tensorboardX.proto.event_pb2 import Event, SessionLog
 
-from mcx_jax import extras, startup
-from mcx_jax.config import preset_config
-from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
-from mcx_jax.progress import Progress, references
-from mcx_jax.results import paper_means
-from mcx_jax.run_dir import open_existing, open_new
+from mcx_jax import extras
+from mcx_jax.compute import startup
+from mcx_jax.config.task import ConditionsConfig, EnvConfig, MotionConfig
+from mcx_jax.config.training import preset_config
+from mcx_jax.evaluation.statistics import paper_means
+from mcx_jax.runs.loop import train
+from mcx_jax.runs.progress import Progress, references
+from mcx_jax.runs.run_dir import open_existing, open_new
 from mcx_jax.train import main
-from mcx_jax.training import train
 
 FAST = preset_config("fast")
 TINY = replace(
@@ -177,7 +178,7 @@ def test_event_files_hold_every_point_once(tmp_path, monkeypatch):
     assert [step for step, _ in _curves(path)["reward"]] == [64, 128]
     # As if killed after an iteration beyond the checkpoint: that one will be written again.
     with monkeypatch.context() as patch:
-        patch.setattr("mcx_jax.training.save", lambda run, state, rows: _no_save())
+        patch.setattr("mcx_jax.runs.loop.save", lambda run, state, rows: _no_save())
         with pytest.raises(RuntimeError, match="killed"):
             train(open_existing(path, TINY), _make_env, events=True)
     train(open_existing(path, TINY), _make_env, events=True)

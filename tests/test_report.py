@@ -13,16 +13,19 @@ import jax
 import numpy as np
 import pytest
 
-from mcx_jax import cli, episodes, extras, palette
-from mcx_jax.config import TrainConfig
-from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
-from mcx_jax.envs.model import torque_limits_nm
+from mcx_jax import extras, palette
+from mcx_jax.arm.model import torque_limits_nm
+from mcx_jax.config import command_line
+from mcx_jax.config.task import ConditionsConfig, EnvConfig, MotionConfig
+from mcx_jax.config.training import TrainConfig
+from mcx_jax.controllers.by_name import load_controller
 from mcx_jax.errors import UserError
 from mcx_jax.evaluate import errors_beside_ik, evaluate_beside_ik, evaluation_env
-from mcx_jax.paper import table3
-from mcx_jax.policy import Policy, PolicyMeta, save_policy
-from mcx_jax.ppo.networks import init_params
-from mcx_jax.ppo.normalise import init_stats
+from mcx_jax.evaluation import episodes
+from mcx_jax.evaluation.paper import table3
+from mcx_jax.policy.file import Policy, PolicyMeta, save_policy
+from mcx_jax.policy.networks import init_params
+from mcx_jax.policy.normalise import init_stats
 from mcx_jax.report import build, entries, figures, sections, style
 from mcx_jax.report.__main__ import main
 from mcx_jax.report.episode import Episode, lag_s, record
@@ -32,7 +35,6 @@ from mcx_jax.report.page import page
 from mcx_jax.report.sections import Section
 from mcx_jax.report.spectra import motion_spectra
 from mcx_jax.report.table import table
-from mcx_jax.roster import load_controller
 
 STEPS, EPISODES, SEED = 90, 2, 3
 # implicitfast chatters less than Euler: rounding grows little.
@@ -43,7 +45,7 @@ OPTIONS = ["--episodes", str(EPISODES), "--episode-steps", str(STEPS), "--seed",
 def make_run(path, env=TASK, seeds=2):
     """A run directory with an untrained policy and made-up metrics of two iterations."""
     path.mkdir(parents=True)
-    text = cli.config_to_json(
+    text = command_line.config_to_json(
         TrainConfig(seeds=seeds, env=dataclasses.replace(env, episode_steps=1024))
     )
     meta = PolicyMeta(obs_size=38, action_size=6, hidden=8, config=text)
@@ -354,7 +356,7 @@ def test_a_known_delay_is_found():
 
 
 def test_torque_limits_add_over_a_joints_actuators():
-    from mcx_jax.envs.model import chain_model, load_mujoco
+    from mcx_jax.arm.model import chain_model, load_mujoco
 
     # Two servos a joint, each +-330, 330, 150, 56, 56, 56 N m (authors' code).
     limits = torque_limits_nm(chain_model(load_mujoco("paper"), "tool"))

@@ -4,11 +4,16 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from mcx_jax import results
-from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
+from mcx_jax.config.task import ConditionsConfig, EnvConfig, MotionConfig
 from mcx_jax.errors import UserError
-from mcx_jax.paper import is_papers_world, table3
-from mcx_jax.results import WARM_UP_STEPS, bootstrap_interval, effort, interquartile_mean
+from mcx_jax.evaluation import statistics
+from mcx_jax.evaluation.paper import is_papers_world, table3
+from mcx_jax.evaluation.statistics import (
+    WARM_UP_STEPS,
+    bootstrap_interval,
+    effort,
+    interquartile_mean,
+)
 
 SEAS, DELAYS = ("Wa", "Wb", "Wc", "Wd"), ("E0", "E1", "E2", "B4_21", "B4_4")
 
@@ -17,7 +22,7 @@ def test_statistics_by_hand():
     # 1..100: mean 50.5, variance (100^2 - 1) / 12 = 833.25, std 28.8661; worst 5 %: 96..100, mean
     # 98; worst 1 %: 100.
     points = np.random.default_rng(0).permutation(np.arange(1.0, 101.0)).reshape(20, 5)
-    got = results.error_statistics(points)
+    got = statistics.error_statistics(points)
     assert got["mean"] == pytest.approx(50.5, rel=1e-12)
     assert got["std"] == pytest.approx(28.86607, rel=1e-6)
     assert (got["top5"], got["top1"], got["max"]) == (98.0, 100.0, 100.0)
@@ -36,24 +41,24 @@ def test_statistics_by_hand():
     ],
 )
 def test_shares_are_rounded_up(count, top5, top1):
-    got = results.error_statistics(np.arange(1.0, count + 1)[:, None])
+    got = statistics.error_statistics(np.arange(1.0, count + 1)[:, None])
     assert got["top5"] == pytest.approx(top5, rel=1e-12)
     assert got["top1"] == pytest.approx(top1, rel=1e-12)
 
 
 def test_statistics_sum_in_float64():
     # 50 episodes of 950 steps in float32: naive sums lose the fifth digit.
-    got = results.error_statistics(np.full((950, 50), np.float32(0.1)))
+    got = statistics.error_statistics(np.full((950, 50), np.float32(0.1)))
     assert got["mean"] == pytest.approx(float(np.float32(0.1)), rel=1e-12)
     assert got["std"] < 1e-12
 
 
 def test_row_drops_the_first_second_and_changes_units():
-    steps = results.WARM_UP_STEPS + 4
+    steps = statistics.WARM_UP_STEPS + 4
     pos_m = np.full((steps, 2), 99.0)
     pos_m[-4:] = [[1e-3, 2e-3], [3e-3, 4e-3], [5e-3, 6e-3], [7e-3, 8e-3]]
-    row = results.row("ik", "E1", "Wb", pos_m, 2 * pos_m, np.array([True, False]))
-    assert results.WARM_UP_STEPS == 50  # paper
+    row = statistics.row("ik", "E1", "Wb", pos_m, 2 * pos_m, np.array([True, False]))
+    assert statistics.WARM_UP_STEPS == 50  # paper
     assert row["pos_mm"]["mean"] == pytest.approx(4.5, rel=1e-12)
     assert row["pos_mm"]["max"] == pytest.approx(8.0, rel=1e-12)
     assert row["ang_mrad"]["mean"] == pytest.approx(9.0, rel=1e-12)
@@ -65,7 +70,7 @@ def test_improvement_by_hand():
     ours = {"mean": 1.0, "std": 9.0, "top5": 2.0, "top1": 6.0, "max": 12.0}
     base = {"mean": 4.0, "std": 1.0, "top5": 4.0, "top1": 6.0, "max": 8.0}
     want = {"all": 0.75, "top5": 0.5, "top1": 0.0, "max": -0.5}
-    assert results.improvement(ours, base) == want
+    assert statistics.improvement(ours, base) == want
 
 
 def test_improvement_is_over_the_baseline_of_the_same_sea():
@@ -74,7 +79,7 @@ def test_improvement_is_over_the_baseline_of_the_same_sea():
         return {"sea": sea, "pos_mm": stats, "ang_mrad": {k: 3 * v for k, v in stats.items()}}
 
     rows = [one("Wa", 1.0), one("Wd", 1.0)]
-    results.add_improvement(rows, [one("Wd", 4.0), one("Wa", 2.0)])
+    statistics.add_improvement(rows, [one("Wd", 4.0), one("Wa", 2.0)])
     assert rows[0]["improvement"]["pos"]["all"] == pytest.approx(0.5)
     assert rows[1]["improvement"]["ang"]["max"] == pytest.approx(0.75)
 
@@ -91,11 +96,11 @@ def test_table3_is_complete_and_consistent():
 
 def test_table3_by_hand():
     # E0 in Wa: 0.39 mm at an improvement of 58 %: 0.39 / 0.42 = 0.93 mm; 0.50 / 0.35 = 1.43 mrad.
-    assert results.paper_errors("ik", "E0", "Wa") == (0.93, 1.43)
-    assert results.paper_errors("some/run", "E0", "Wa") == (0.39, 0.50)
-    assert results.paper_errors("ik", "B4_4", "Wd") == (8.08, 5.39)
-    assert results.paper_errors("ik", "E7", "Wa") is None
-    assert results.paper_errors("ik", "E0", "1.5:8") is None
+    assert statistics.paper_errors("ik", "E0", "Wa") == (0.93, 1.43)
+    assert statistics.paper_errors("some/run", "E0", "Wa") == (0.39, 0.50)
+    assert statistics.paper_errors("ik", "B4_4", "Wd") == (8.08, 5.39)
+    assert statistics.paper_errors("ik", "E7", "Wa") is None
+    assert statistics.paper_errors("ik", "E0", "1.5:8") is None
 
 
 IDEAL = [
@@ -177,12 +182,12 @@ def test_strain_counts_steps_after_the_warm_up():
     found[0] = True
     found[-1, 0, :2] = found[-2:, 1, 3] = True
     found[-1, 0, 3] = True
-    assert results.strain(found) == {"strain": {"steps": 12, "out_of_reach": 3, "too_fast": 2}}
+    assert statistics.strain(found) == {"strain": {"steps": 12, "out_of_reach": 3, "too_fast": 2}}
 
 
 @pytest.mark.filterwarnings("error")
 def test_effort_of_nothing_finite_is_refused_not_nan():
-    steps = results.LEAST_STEPS
+    steps = statistics.LEAST_STEPS
     correction, share = np.zeros((steps, 6, 2)), np.full((steps, 2), 0.25)
     assert effort(correction, share)["correction"]["rate_cm_s"] == 0.0
     for bad, good in ((correction * np.nan, share), (correction, share * np.nan)):
@@ -196,4 +201,4 @@ def test_effort_of_nothing_finite_is_refused_not_nan():
 def test_errors_beyond_all_numbers_are_refused():
     pos_m = np.full((WARM_UP_STEPS + 2, 1), np.float32(3e37))
     with pytest.raises(UserError, match="ik, E1, Wb: errors beyond all numbers"):
-        results.row("ik", "E1", "Wb", pos_m, pos_m, np.array([False]))
+        statistics.row("ik", "E1", "Wb", pos_m, pos_m, np.array([False]))

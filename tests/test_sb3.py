@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mcx_jax.gym import ENV_ID
+from mcx_jax.integrations.gym import ENV_ID
 
 sb3 = pytest.importorskip("stable_baselines3")
 

@@ -4,8 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from mcx_jax.config import TrainConfig
-from mcx_jax.env_config import MotionConfig
+from mcx_jax.config.task import MotionConfig
+from mcx_jax.config.training import TrainConfig
 from mcx_jax.envs.motion import draw_track, load_motion
 from mcx_jax.errors import UserError
 from mcx_jax.sea.recording import MIN_DURATION_S, load_recording, split_recording

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcx_jax.delay import SUBSTEPS
-from mcx_jax.env_config import MotionConfig
+from mcx_jax.config.delay import SUBSTEPS
+from mcx_jax.config.task import MotionConfig
 from mcx_jax.envs.motion import LOOK_AHEAD_STEPS, load_motion
-from mcx_jax.sea.sampler import (
+from mcx_jax.envs.sampler import (
     KNOT_STEPS,
     PHYSICS_DT_S,
     body_rates,

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcx_jax.delay import CONTROL_DT_S, SUBSTEPS
-from mcx_jax.envs import chain, servo
-from mcx_jax.envs.arm import load_arm, start_pose
+from mcx_jax.arm import chain, servo
+from mcx_jax.arm.load import load_arm, start_pose
+from mcx_jax.config.delay import CONTROL_DT_S, SUBSTEPS
 from mcx_jax.spatial import ZERO
 
 FASTEST = np.deg2rad([120, 120, 180, 180, 180, 180])

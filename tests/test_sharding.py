@@ -11,17 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mcx_jax.config import PPOConfig, TrainConfig, preset_config
-from mcx_jax.env_config import EnvConfig
-from mcx_jax.sharding import ENV_AXIS, env_mesh, over_envs, put
+from mcx_jax.compute.sharding import ENV_AXIS, env_mesh, over_envs, put
+from mcx_jax.config.task import EnvConfig
+from mcx_jax.config.training import PPOConfig, TrainConfig, preset_config
 
 RUN = """
 import sys
-from mcx_jax import startup
+from mcx_jax.compute import startup
 startup.configure("cpu", cores=int(sys.argv[1]))
 import jax, json
 from probe_envs import make_probe
-from mcx_jax.programs import prepare
+from mcx_jax.runs.programs import prepare
 from test_sharding import CONFIGS
 rows = []
 for config in CONFIGS:

@@ -7,11 +7,9 @@ import sys
 
 import pytest
 
-from mcx_jax import cli, extras, machine, startup
-from mcx_jax.config import TrainConfig
-from mcx_jax.errors import UserError
-from mcx_jax.run_dir import RunDir
-from mcx_jax.startup import (
+from mcx_jax import extras
+from mcx_jax.compute import machine, startup
+from mcx_jax.compute.startup import (
     DEVICES_FLAG,
     FUSION_FLAG,
     PASSES_FLAG,
@@ -19,6 +17,10 @@ from mcx_jax.startup import (
     run_command,
     xla_flags_for,
 )
+from mcx_jax.config import command_line
+from mcx_jax.config.training import TrainConfig
+from mcx_jax.errors import UserError
+from mcx_jax.runs.run_dir import RunDir
 
 
 @pytest.mark.parametrize(
@@ -233,14 +235,15 @@ def test_set_up_says_nothing_where_all_is_usual(monkeypatch, tmp_path):
 
 def test_names_that_are_not_text_are_one_line():
     with pytest.raises(UserError, match="not UTF-8; use a name that is") as error:
-        cli.parse(startup.UserError, ["--run-dir", "r\udcff"], prog="train")
+        command_line.parse(startup.UserError, ["--run-dir", "r\udcff"], prog="train")
     assert "\udcff" not in str(error.value)
 
 
 def test_a_working_directory_that_is_gone_is_one_line(tmp_path, repo_root):
     gone = tmp_path / "gone"
     code = f"import os; os.mkdir({str(gone)!r}); os.chdir({str(gone)!r}); os.rmdir({str(gone)!r})\n"
-    code += "from mcx_jax import startup, train; startup.run_command(lambda: train.main([]))"
+    code += "from mcx_jax import train; from mcx_jax.compute import startup; "
+    code += "startup.run_command(lambda: train.main([]))"
     done = subprocess.run(
         [sys.executable, "-c", code],
         capture_output=True,
@@ -254,6 +257,6 @@ def test_a_working_directory_that_is_gone_is_one_line(tmp_path, repo_root):
 
 def test_nothing_is_printed_on_the_way_to_mjx():
     """MJX prints that warp is missing, in front of what `--json -` writes."""
-    code = "import mcx_jax.mjx_step, mcx_jax.envs.mjx_engine"
+    code = "import mcx_jax.integrations.mjx_step, mcx_jax.arm.mjx_engine"
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert done.stdout == ""

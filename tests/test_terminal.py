@@ -9,10 +9,16 @@ from dataclasses import replace
 
 import pytest
 
-from mcx_jax import terminal
-from mcx_jax.env_config import EnvConfig, MotionConfig
+from mcx_jax.config.task import EnvConfig, MotionConfig
+from mcx_jax.console import terminal
 from mcx_jax.errors import printable
-from mcx_jax.result_table import ONE_DIRECTION_NOTE, PAPER_NOTE, REPEAT_NOTE, percent, print_table
+from mcx_jax.evaluation.table import (
+    ONE_DIRECTION_NOTE,
+    PAPER_NOTE,
+    REPEAT_NOTE,
+    percent,
+    print_table,
+)
 
 SEAS = ("Wa", "Wb", "Wc", "Wd")
 TASK = EnvConfig(), MotionConfig()

@@ -20,18 +20,21 @@ import pytest
 from probe_envs import make_probe
 from test_output import LOST, REASONS
 
-from mcx_jax import checkpoint, cli, command, startup
-from mcx_jax.config import TrainConfig, preset_config
-from mcx_jax.env_config import EnvConfig
+from mcx_jax.compute import startup
+from mcx_jax.config import command_line
+from mcx_jax.config.task import EnvConfig
+from mcx_jax.config.training import TrainConfig, preset_config
+from mcx_jax.console import command
+from mcx_jax.console.streams import Guarded
 from mcx_jax.errors import UserError
-from mcx_jax.policy import load_policy
-from mcx_jax.programs import prepare
-from mcx_jax.progress import Progress, short_time
-from mcx_jax.run_dir import RunDir, default_path, open_existing, open_new
-from mcx_jax.stop import StopRequest
-from mcx_jax.streams import Guarded
+from mcx_jax.policy.file import load_policy
+from mcx_jax.runs import checkpoint
+from mcx_jax.runs.loop import first_policy, rest, rounded_up, table_line, train
+from mcx_jax.runs.programs import prepare
+from mcx_jax.runs.progress import Progress, short_time
+from mcx_jax.runs.run_dir import RunDir, default_path, open_existing, open_new
+from mcx_jax.runs.stop import StopRequest
 from mcx_jax.train import compile_quickly, main, read_command
-from mcx_jax.training import first_policy, rest, rounded_up, table_line, train
 
 CONFIG = replace(
     preset_config("fast"),
@@ -88,7 +91,7 @@ def _assert_same_run(one, other, config):
 def test_what_a_run_writes(finished, capsys):
     names = sorted(p.name for p in finished.iterdir())
     assert names == [".lock", "checkpoints", "config.json", "metrics.jsonl", "policy.npz"]
-    stored = cli.config_from_json(TrainConfig, (finished / "config.json").read_text())
+    stored = command_line.config_from_json(TrainConfig, (finished / "config.json").read_text())
     assert stored == CONFIG
     rows = [json.loads(line) for line in (finished / "metrics.jsonl").read_text().splitlines()]
     assert [row["iteration"] for row in rows] == [1, 2, 3, 4]
@@ -249,7 +252,7 @@ def test_the_command_that_makes_the_table_is_of_the_runs_task(tmp_path):
 
     flags = ["--smoke", "--delay", "E1", "--noise-mm", "0:3", "--sea", "Wd", "--coupled"]
     _, run = read_command([*flags, "--run-dir", str(tmp_path / "run")])
-    asked = cli.parse(EvaluateConfig, shlex.split(table_line(run))[3:], prog="evaluate")
+    asked = command_line.parse(EvaluateConfig, shlex.split(table_line(run))[3:], prog="evaluate")
     assert asked.who == str(run.path)
     assert asked.env == replace(run.config.env, episode_steps=1000)
     assert asked.motion == replace(run.config.motion, sea="all")
@@ -395,7 +398,7 @@ def finished_default(tmp_path):
     with run.held():
         run.create()
     state = {"x": jax.numpy.ones(3)}
-    checkpoint.save(path, config.iterations, state, cli.config_to_json(config))
+    checkpoint.save(path, config.iterations, state, command_line.config_to_json(config))
     return path
 
 
@@ -509,7 +512,7 @@ def test_a_signal_while_the_processes_agree_is_kept(tmp_path, monkeypatch):
             os.kill(os.getpid(), signal.SIGTERM)
         return numbers
 
-    monkeypatch.setattr("mcx_jax.training.hosts.agree", agree)
+    monkeypatch.setattr("mcx_jax.runs.loop.processes.agree", agree)
     with pytest.raises(SystemExit) as stop:
         train(open_new(tmp_path / "run", CONFIG), _make_env)
     assert stop.value.code == 128 + signal.SIGTERM

@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mcx_jax.controllers import IK, Extrapolate, Preview
-from mcx_jax.delay import CONTROL_DT_S, PHYSICS_DT_S, SUBSTEPS
-from mcx_jax.env_config import EnvConfig, MotionConfig
-from mcx_jax.envs import chain, ik, lag, observe, servo, vessels
-from mcx_jax.envs.model import load_mujoco
+from mcx_jax.arm import chain, ik, lag, servo
+from mcx_jax.arm.model import load_mujoco
+from mcx_jax.config.delay import CONTROL_DT_S, PHYSICS_DT_S, SUBSTEPS
+from mcx_jax.config.task import EnvConfig, MotionConfig
+from mcx_jax.controllers.classical import IK, Extrapolate, Preview
+from mcx_jax.envs import observe, vessels
 from mcx_jax.envs.motion import LOOK_AHEAD_STEPS, draw_track, load_motion
+from mcx_jax.envs.sampler import KNOT_STEPS
 from mcx_jax.envs.v2v import MAX_ERROR_M, SETTLE_STEPS, correct, make_env
 from mcx_jax.errors import UserError
-from mcx_jax.sea.sampler import KNOT_STEPS
 from mcx_jax.spatial import unpack, unpack_matrix
 
 STEPS = 12

@@ -1,7 +1,8 @@
 """Reverse mode of the inverse dynamics, link by link.
 
 XLA's reverse mode of the whole recursion has no walls: each of its ~25 results recomputes what it
-shares with the others (mcx_jax.stage). Here every link is a stage of its own, forward and back.
+shares with the others (`mcx_jax.compute.fusion`). Here every link is a stage of its own, forward
+and back.
 """
 
 from collections.abc import Sequence
@@ -11,10 +12,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mcx_jax.envs.dynamics import BaseState, inertial_wrench, link_motion
-from mcx_jax.envs.model import ChainModel, Link
+from mcx_jax.arm.dynamics import BaseState, inertial_wrench, link_motion
+from mcx_jax.arm.model import ChainModel, Link
+from mcx_jax.compute.fusion import split_floats, stage
 from mcx_jax.spatial import ZERO, Scalar, Vec, add, cross, dot, mul, rotate_z, sub, tmatvec, vadd
-from mcx_jax.stage import split_floats, stage
 
 Carry = tuple[BaseState, tuple[Vec, Vec]]
 """Motion (w, al, a) of a link, and its virtual twist (angular, linear at its origin)."""
@@ -88,7 +89,7 @@ def _pull_back(link: Link, carry: Carry, joint: Joint, d_after: Any) -> tuple[An
             return own
         return add(own, _inner(after, d_after))
 
-    # Not jax.grad: in a whole batch (mcx_jax.batch_last) the power is one number an environment.
+    # Not jax.grad: in a whole batch (`compute.batch_last`) the power is one number per environment.
     value, pull = jax.vjp(power, traced)
     (gradient,) = pull(jnp.ones_like(value))
     d_carry, (d_sin, d_cos, d_rate) = join(gradient)

@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from mcx_jax.envs.adjoint import inverse_dynamics_gradient
-from mcx_jax.envs.dynamics import BaseState, bias_forces, factor, joint_sincos, mass_matrix, solve
-from mcx_jax.envs.model import Actuator, ChainModel
-from mcx_jax.envs.plant import Plant, carried_by
+from mcx_jax.arm.adjoint import inverse_dynamics_gradient
+from mcx_jax.arm.dynamics import BaseState, bias_forces, factor, joint_sincos, mass_matrix, solve
+from mcx_jax.arm.model import Actuator, ChainModel
+from mcx_jax.arm.plant import Plant, carried_by
+from mcx_jax.compute.fusion import stage
 from mcx_jax.spatial import Scalar, add, mul, sub, total
-from mcx_jax.stage import stage
 
 SMOOTH = "-smooth"
 """Ending of an integrator's name that changes its derivative, see `joint_accelerations`."""

@@ -8,7 +8,7 @@ acceleration, so an accelerating deck is exact and costs nothing.
 
 from collections.abc import Sequence
 
-from mcx_jax.envs.model import ChainModel, Link
+from mcx_jax.arm.model import ChainModel, Link
 from mcx_jax.spatial import (
     Mat,
     Scalar,

@@ -1,6 +1,6 @@
 """Every field of MuJoCo's compiled model: read, refused, or without effect here and why.
 
-One table for the chain engine, `mcx_jax.mjx_step` and the task. A field of `mjModel` or `mjOption`
+One table for the chain engine, `mjx_step` and the task. A field of `mjModel` or `mjOption`
 that is in none of its parts fails tests/test_fields.py by its name; so does one that changes a step
 of C MuJoCo though it stands among those without effect. What the task refuses on top of it
 (`envs.arm`) are values of fields that are read.

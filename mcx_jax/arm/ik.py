@@ -16,8 +16,9 @@ import jax.numpy as jnp
 from flax import struct
 from jax import lax
 
-from mcx_jax.envs import dynamics
-from mcx_jax.envs.model import ChainModel
+from mcx_jax.arm import dynamics
+from mcx_jax.arm.model import ChainModel
+from mcx_jax.compute.fusion import stage
 from mcx_jax.spatial import (
     EYE,
     ZERO,
@@ -37,7 +38,6 @@ from mcx_jax.spatial import (
     vadd,
     vsub,
 )
-from mcx_jax.stage import stage
 
 REGULARISATION = 3e-2
 """Damping of the normal equations far from the target (dm_control's default)."""

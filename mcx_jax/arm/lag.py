@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mcx_jax.delay import NYQUIST_HZ, Delay
+from mcx_jax.config.delay import NYQUIST_HZ, Delay
 
 
 @struct.dataclass

@@ -2,8 +2,8 @@
 
 from mujoco import MjModel
 
-from mcx_jax.delay import PHYSICS_DT_S
-from mcx_jax.envs.model import ChainModel, chain_model, load_mujoco
+from mcx_jax.arm.model import ChainModel, chain_model, load_mujoco
+from mcx_jax.config.delay import PHYSICS_DT_S
 from mcx_jax.errors import UserError
 from mcx_jax.sea.spectrum import GRAVITY_M_S2
 

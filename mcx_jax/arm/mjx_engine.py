@@ -13,10 +13,10 @@ import mujoco
 import numpy as np
 from jax import lax
 
-from mcx_jax.envs.dynamics import BaseState
-from mcx_jax.envs.model import with_joints_carrying_servos
+from mcx_jax.arm.dynamics import BaseState
+from mcx_jax.arm.model import with_joints_carrying_servos
+from mcx_jax.arm.quiet_mjx import mjx
 from mcx_jax.errors import UserError, reason
-from mcx_jax.quiet_mjx import mjx
 
 INTEGRATORS = {
     "euler": mujoco.mjtIntegrator.mjINT_EULER,

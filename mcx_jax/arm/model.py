@@ -15,8 +15,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from mcx_jax.arm.fields import integrator, moving_ancestor, refuse_unsupported
 from mcx_jax.assets import asset_path
-from mcx_jax.envs.fields import integrator, moving_ancestor, refuse_unsupported
 from mcx_jax.errors import UserError
 from mcx_jax.spatial import ZERO, Mat, Scalar, Vec, snap
 

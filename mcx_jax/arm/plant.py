@@ -5,7 +5,7 @@ from dataclasses import replace
 import jax
 from flax import struct
 
-from mcx_jax.envs.model import ChainModel, Link
+from mcx_jax.arm.model import ChainModel, Link
 from mcx_jax.spatial import add, mul, sub, vadd, vscale
 
 

@@ -15,8 +15,8 @@ and until it was made up for here the largest orientation error of nearly every 
 import jax
 import jax.numpy as jnp
 
-from mcx_jax.delay import CONTROL_DT_S
-from mcx_jax.envs.model import ChainModel
+from mcx_jax.arm.model import ChainModel
+from mcx_jax.config.delay import CONTROL_DT_S
 
 LEAD_MADE_UP = 0.7
 """Share of the lost lead that is given back; 1 is what a joint that stays so fast would need, and

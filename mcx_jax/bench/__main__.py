@@ -5,7 +5,7 @@ times apart. Ratios are measured again, engine and rival in turn, and given as a
 """
 
 if __name__ == "__main__":
-    from mcx_jax.command import begin
+    from mcx_jax.console.command import begin
 
     begin()
 
@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from mcx_jax import machine
 from mcx_jax.bench.timing import REPEATS
+from mcx_jax.compute import machine
 from mcx_jax.errors import UserError
 
 ENVS = (1, 8, 64, 512, 2048, 16384)
@@ -53,7 +53,7 @@ def run(quick: bool, say) -> dict[str, Any]:
         say: prints a line of progress.
     """
     from mcx_jax.bench import program, startup_time
-    from mcx_jax.config import TrainConfig
+    from mcx_jax.config.training import TrainConfig
     from mcx_jax.envs.v2v import make_env
 
     figures: dict[str, Any] = {"device": machine.device(), "versions": machine.versions()}
@@ -166,12 +166,16 @@ def peak_memory_gib() -> float | None:
 
 def main(argv: list[str] | None = None) -> None:
     """Command line."""
-    from mcx_jax import cli, extras, startup
+    from mcx_jax import extras
+    from mcx_jax.compute import startup
+    from mcx_jax.config import command_line
 
     argv = list(sys.argv[1:] if argv is None else argv)
-    config = cli.parse(BenchConfig, cli.optional_value(argv, "--json", "-"), prog="bench")
-    cli.check_output("--json", config.json)
-    cli.check_output("--plot", config.plot)
+    config = command_line.parse(
+        BenchConfig, command_line.optional_value(argv, "--json", "-"), prog="bench"
+    )
+    command_line.check_output("--json", config.json)
+    command_line.check_output("--plot", config.plot)
     if config.plot and Path(config.plot).suffix not in (".png", ".svg"):
         raise UserError(f"--plot {config.plot}: the name must end in .png or .svg")
     if config.plot:
@@ -188,7 +192,7 @@ def main(argv: list[str] | None = None) -> None:
     if config.json == "-":
         print(text)
     elif config.json:
-        cli.write_output("--json", config.json, text + "\n")
+        command_line.write_output("--json", config.json, text + "\n")
     if config.plot:
         from mcx_jax.bench.plot import draw
 
@@ -196,6 +200,6 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    from mcx_jax.startup import run_command
+    from mcx_jax.compute.startup import run_command
 
     run_command(main)

@@ -15,13 +15,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from mcx_jax import machine
+from mcx_jax.arm import chain
+from mcx_jax.arm.model import ChainModel, chain_model, load_mujoco
 from mcx_jax.bench.timing import median_s
-from mcx_jax.delay import SUBSTEPS
-from mcx_jax.envs import chain
-from mcx_jax.envs.model import ChainModel, chain_model, load_mujoco
-from mcx_jax.sharding import env_mesh, put
-from mcx_jax.startup import needs_old_emitters
+from mcx_jax.compute import machine
+from mcx_jax.compute.sharding import env_mesh, put
+from mcx_jax.compute.startup import needs_old_emitters
+from mcx_jax.config.delay import SUBSTEPS
 
 AT_REST = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 9.81))
 """`chain.BaseState` of a level base at rest."""
@@ -81,7 +81,7 @@ def c_batch(envs: int) -> Work:
 
 def mjx(envs: int) -> Work:
     """MJX, without contact and constraint work."""
-    from mcx_jax.quiet_mjx import mjx as mj_x
+    from mcx_jax.arm.quiet_mjx import mjx as mj_x
 
     model = load_mujoco("paper")
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)

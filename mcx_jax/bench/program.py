@@ -8,19 +8,20 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
+from mcx_jax.arm import ik, lag
 from mcx_jax.bench.timing import REPEATS, median_s, samples_s
-from mcx_jax.config import TrainConfig
-from mcx_jax.delay import CONTROL_DT_S, SUBSTEPS
-from mcx_jax.envs import ik, lag, observe, vessels
+from mcx_jax.compute.fusion import stage
+from mcx_jax.compute.sharding import env_mesh, put
+from mcx_jax.config.delay import CONTROL_DT_S, SUBSTEPS
+from mcx_jax.config.training import TrainConfig
+from mcx_jax.envs import observe, vessels
 from mcx_jax.envs.state import ArmState, EnvState
 from mcx_jax.envs.v2v import V2VEnv
 from mcx_jax.ppo import rollout, trainer
 from mcx_jax.ppo.experience import judge
 from mcx_jax.ppo.update import learn
-from mcx_jax.programs import prepare
-from mcx_jax.sharding import env_mesh, put
+from mcx_jax.runs.programs import prepare
 from mcx_jax.spatial import unpack
-from mcx_jax.stage import stage
 
 RESET_ENVS = 256
 STEPS = 10

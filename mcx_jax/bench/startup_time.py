@@ -7,7 +7,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from mcx_jax.command import interruptible
+from mcx_jax.console.command import interruptible
 from mcx_jax.errors import UserError
 
 LIMIT_S = 600.0

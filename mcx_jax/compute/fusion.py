@@ -10,7 +10,7 @@ Walls belong around everything that several results share: a control step of the
 them (2048 environments, two devices).
 
 XLA also splits every fusion over all threads of a device and waits for them after each, which loses
-more than it wins: hence one device per core (mcx_jax.sharding).
+more than it wins: hence one device per core (mcx_jax.compute.sharding).
 """
 
 from collections.abc import Callable, Sequence

@@ -1,4 +1,4 @@
-"""Processes of one run tell each other that they are alive (`mcx_jax.hosts`).
+"""Processes of one run tell each other that they are alive (`mcx_jax.compute.processes`).
 
 They compute in lockstep: one that is alive but stopped, or whose network falls silent, holds up all
 others, and no connection breaks. So every process says a byte to process 0 now and then, and that

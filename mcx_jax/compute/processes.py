@@ -1,8 +1,9 @@
 """Several processes that train one run, on one machine or on many: who writes, what is agreed on.
 
 The programs are the same as in one process: XLA's partitioner sees the devices of all of them
-(`mcx_jax.sharding`). What is left for Python: process 0 alone writes and prints, all decide alike,
-and who loses a partner stops. Every process needs to see the run's directory.
+(`mcx_jax.compute.sharding`). In Python only this remains: process 0 writes and prints, all
+processes agree on decisions, and each stops if another dies. Every process must see the run's
+directory.
 """
 
 import contextlib
@@ -16,7 +17,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from mcx_jax import heartbeat
+from mcx_jax.compute import heartbeat
 from mcx_jax.errors import UserError, reason
 
 PLACE = re.compile(r"(?P<coordinator>[^,\s]+:(?P<port>\d+)),(?P<index>\d+)/(?P<count>\d+)")

@@ -12,7 +12,9 @@ from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
-from mcx_jax import extras, hosts, jax_settings, machine, streams
+from mcx_jax import extras
+from mcx_jax.compute import jax_settings, machine, processes
+from mcx_jax.console import streams
 from mcx_jax.errors import UserError, reason
 
 FUSION_FLAG = "--xla_cpu_use_fusion_emitters"
@@ -83,7 +85,7 @@ def configure(
         device: "auto", "cpu" or "gpu".
         mjx: MJX will run in this process.
         cores: devices that the CPU shall count as; None = all cores that this process may use.
-        distributed: the other processes of this run (`mcx_jax.hosts.join`).
+        distributed: the other processes of this run (`mcx_jax.compute.processes.join`).
 
     Returns:
         What the user has to know: a line for each thing that is otherwise than usual.
@@ -108,7 +110,7 @@ def configure(
     # TF32 would round the policy's inputs to 10 bits: 1 mm in 1 m, the size of the errors here.
     jax.config.update("jax_default_matmul_precision", "float32")
     said += _use_cache(jax)
-    hosts.join(distributed)  # which JAX allows only before it has looked for devices
+    processes.join(distributed)  # which JAX allows only before it has looked for devices
     _check_device(jax, device)
     return said
 
@@ -175,7 +177,7 @@ def _check_device(jax, device: str) -> None:
 
 def run_command(main: Callable[[], None]) -> None:
     """Run a command's `main`: a `UserError` becomes one line on stderr and exit code 2, Ctrl-C
-    ends with code 130, and output that cannot be written ends nothing (`mcx_jax.streams`)."""
+    ends with code 130, and output that cannot be written ends nothing (`console.streams`)."""
     streams.guard()
     try:
         main()

@@ -1,6 +1,6 @@
 """How late an arm answers: the names of delays, and what they mean. And the rates of time.
 
-A delay is named on the command line (`--delay`); `mcx_jax.envs.lag` is what it does.
+A delay is named on the command line (`--delay`); `mcx_jax.arm.lag` is what it does.
 """
 
 import math

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from mcx_jax.delay import Delay, parse_delay
+from mcx_jax.config.delay import Delay, parse_delay
 from mcx_jax.errors import UserError, require
 
 COUPLED = "-coupled"

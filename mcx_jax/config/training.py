@@ -1,14 +1,15 @@
 """Every setting of training, each with one default and one sentence; validated on construction.
 
-The command lines are generated from these dataclasses (`mcx_jax.cli`), so a field's docstring is
-its help text. Derived values are properties. All classes are hashable: they are static under jit.
+The command lines are generated from these dataclasses (`mcx_jax.config.command_line`), so a field's
+docstring is its help text. Derived values are properties. All classes are hashable: they are
+static under jit.
 """
 
 import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from mcx_jax.env_config import EnvConfig, MotionConfig
+from mcx_jax.config.task import EnvConfig, MotionConfig
 from mcx_jax.errors import UserError, require
 
 ADDED = {"added": True}

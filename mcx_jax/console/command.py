@@ -1,7 +1,7 @@
 """What a command (`python -m mcx_jax.NAME`) begins with, before imports that take seconds.
 
     if __name__ == "__main__":
-        from mcx_jax.command import begin
+        from mcx_jax.console.command import begin
 
         begin()
 
@@ -18,7 +18,7 @@ import sys
 from collections.abc import Callable, Iterator
 from types import FrameType
 
-from mcx_jax import streams
+from mcx_jax.console import streams
 
 _words: list[Callable[[], str]] = [lambda: "stopped"]
 

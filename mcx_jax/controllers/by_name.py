@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from mcx_jax.assets import policy_file
-from mcx_jax.delay import parse_delay
-from mcx_jax.env_config import EnvConfig, MotionConfig
+from mcx_jax.config.delay import parse_delay
+from mcx_jax.config.task import EnvConfig, MotionConfig
+from mcx_jax.console.terminal import silent
 from mcx_jax.errors import UserError
-from mcx_jax.terminal import silent
 
 WHO = ("ik", "extrapolate", "extrapolate-best", "fir", "preview")
 FITTED = ("extrapolate-best", "fir")
@@ -43,10 +43,10 @@ def load_controller(who: str) -> tuple[str, Any]:
     if who in FITTED:
         return who, None
     if path is None:
-        from mcx_jax.controllers import CLASSICAL
+        from mcx_jax.controllers.classical import CLASSICAL
 
         return who, CLASSICAL[who]
-    from mcx_jax.policy import PolicyController, load_policy, require_task
+    from mcx_jax.policy.file import PolicyController, load_policy, require_task
 
     policy = load_policy(path)
     require_task(path, policy.meta)
@@ -64,12 +64,12 @@ def fit_if_needed(
     """The controller of `load_controller`, fitted on training motion if it is one of FITTED.
 
     Args:
-        say: what happens is said to it (`mcx_jax.terminal.working`).
+        say: what happens is said to it (`mcx_jax.console.terminal.working`).
     """
     if controller is not None:
         return controller
+    from mcx_jax.controllers.fitted import fitted
     from mcx_jax.envs.v2v import make_env
-    from mcx_jax.fitted import fitted
 
     env = informed(make_env(env_config, motion_config, split="train"), known_delay)
     return fitted(who, env, say)

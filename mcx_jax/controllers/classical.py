@@ -1,7 +1,7 @@
 """Controllers without learning: what a correction policy has to beat.
 
 A controller is `init(env, state) -> memory` and `act(env, state, memory) -> (memory, action)`, both
-for ONE episode; a trained policy has the same two functions (`mcx_jax.policy.PolicyController`).
+for ONE episode; a trained policy has the same two functions (`policy.file.PolicyController`).
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mcx_jax.delay import CONTROL_DT_S, PHYSICS_DT_S
+from mcx_jax.compute.fusion import stage
+from mcx_jax.config.delay import CONTROL_DT_S, PHYSICS_DT_S
 from mcx_jax.envs.state import EnvState
 from mcx_jax.envs.v2v import ACTION_SCALE, V2VEnv
 from mcx_jax.spatial import (
@@ -29,7 +30,6 @@ from mcx_jax.spatial import (
     vscale,
     vsub,
 )
-from mcx_jax.stage import stage
 
 HOLD_LEAD_S = 0.010
 """A reference is held for 20 ms; on average it is 10 ms old when the arm follows it."""
@@ -110,9 +110,9 @@ def moved(pose: tuple[Mat, Vec], change: Sequence[Scalar], wall: jax.Array | Non
     """A goal's pose in B after a change in B's axes: 3 m, 3 rad (rotation vector).
 
     Args:
-        wall: see `mcx_jax.stage`. Without walls XLA computed a controller's rotations again for
-            every number of its action: a control step of `extrapolate` took 195 us instead of 3
-            (256 episodes at once).
+        wall: see `mcx_jax.compute.fusion`. Without walls XLA computed a controller's rotations
+            again for every number of its action: a control step of `extrapolate` took 195 us
+            instead of 3 (256 episodes at once).
     """
     turn = stage(wall, exp_rotation, tuple(change[3:]))
     return stage(wall, matmul, turn, pose[0]), vadd(pose[1], tuple(change[:3]))  # type: ignore[arg-type]
@@ -133,4 +133,4 @@ def turn_of(a: Mat, b: Mat, wall: jax.Array | None = None) -> Vec:
 
 
 CLASSICAL = {"ik": IK(), "extrapolate": Extrapolate(), "preview": Preview()}
-"""Controllers by the name that the command line uses; `mcx_jax.fitted` has two more."""
+"""Controllers by the name that the command line uses; `mcx_jax.controllers.fitted` has two more."""

@@ -15,15 +15,16 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from mcx_jax.controllers import HOLD_LEAD_S, Extrapolate, correction, moved, turn_of
-from mcx_jax.delay import PHYSICS_DT_S, SUBSTEPS
+from mcx_jax.config.delay import PHYSICS_DT_S, SUBSTEPS
+from mcx_jax.console.terminal import silent
+from mcx_jax.controllers.classical import HOLD_LEAD_S, Extrapolate, correction, moved, turn_of
 from mcx_jax.envs import conditions
 from mcx_jax.envs.motion import LOOK_AHEAD_STEPS
 from mcx_jax.envs.state import EnvState
 from mcx_jax.envs.v2v import V2VEnv
-from mcx_jax.episodes import episode_errors
 from mcx_jax.errors import UserError
-from mcx_jax.results import WARM_UP_STEPS
+from mcx_jax.evaluation.episodes import episode_errors
+from mcx_jax.evaluation.statistics import WARM_UP_STEPS
 from mcx_jax.spatial import (
     log_rotation,
     matmul,
@@ -31,7 +32,6 @@ from mcx_jax.spatial import (
     unpack,
     unpack_matrix,
 )
-from mcx_jax.terminal import silent
 
 TAPS = 25
 """Poses that the filter sees, half a second of them."""
@@ -74,7 +74,7 @@ def features(poses: jax.Array, wall: jax.Array | None = None) -> jax.Array:
 
     Args:
         poses: (TAPS, 12).
-        wall: see `mcx_jax.stage`.
+        wall: see `mcx_jax.compute.fusion`.
     """
     r, p = poses[:, :9].reshape(-1, 3, 3), poses[:, 9:]
     now = unpack_matrix(r[-1])
@@ -136,7 +136,7 @@ def fitted(who: str, env: V2VEnv, say: Callable[[str], None] = silent) -> Any:
 
     Args:
         env: on training motion.
-        say: what happens is said to it (`mcx_jax.terminal.working`).
+        say: what happens is said to it (`mcx_jax.console.terminal.working`).
 
     Raises:
         UserError: none of them keeps the arm's state finite.

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mcx_jax.delay import CONTROL_DT_S
-from mcx_jax.env_config import ConditionsConfig, EnvConfig, Range
-from mcx_jax.envs.plant import Plant
+from mcx_jax.arm.plant import Plant
+from mcx_jax.config.delay import CONTROL_DT_S
+from mcx_jax.config.task import ConditionsConfig, EnvConfig, Range
 from mcx_jax.spatial import Mat, Vec, exp_rotation, matmul, unpack, unpack_matrix, vadd, vscale
 
 CONDITIONS_STREAM = 1

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from mcx_jax.delay import PHYSICS_DT_S
+from mcx_jax.config.delay import PHYSICS_DT_S
 from mcx_jax.errors import UserError
 
 PERIOD_S = 6.0

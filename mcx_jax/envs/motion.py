@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mcx_jax.delay import CONTROL_DT_S, SUBSTEPS
-from mcx_jax.env_config import MotionConfig
+from mcx_jax.config.delay import CONTROL_DT_S, SUBSTEPS
+from mcx_jax.config.task import MotionConfig
+from mcx_jax.console.notice import notice
+from mcx_jax.envs.sampler import KNOT_STEPS
 from mcx_jax.errors import UserError
-from mcx_jax.notice import notice
-from mcx_jax.sea.sampler import KNOT_STEPS
 
 NAMED_SEAS = ("Wa", "Wb", "Wc", "Wd")
 LOOK_AHEAD_STEPS = 100

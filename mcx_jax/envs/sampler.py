@@ -10,10 +10,10 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 
-from mcx_jax.delay import PHYSICS_DT_S
+from mcx_jax.compute.fusion import stage
+from mcx_jax.config.delay import PHYSICS_DT_S
 from mcx_jax.sea.tables import KNOT_DT_S, KNOT_STEPS
 from mcx_jax.spatial import Scalar, Vec
-from mcx_jax.stage import stage
 
 __all__ = ["KNOT_STEPS", "PHYSICS_DT_S", "body_rates", "hermite", "segment_rows"]
 
@@ -27,7 +27,7 @@ def segment_rows(
         knots: (tables, rows, 12), see `mcx_jax.sea.tables.MotionTables`.
         table: () int32.
         step: () int32, physics steps of 2 ms since the table's start, 0 <= step < 50 (rows - 1).
-        wall: see `mcx_jax.stage`; without it the division is repeated for all 24 numbers.
+        wall: see `mcx_jax.compute.fusion`; without it the division is repeated for all 24 numbers.
 
     Returns:
         row0, row1: (12,) each; the instant lies `step % KNOT_STEPS` physics steps after row0.

@@ -3,8 +3,8 @@
 import jax
 from flax import struct
 
+from mcx_jax.arm.lag import LagState
 from mcx_jax.envs.conditions import Conditions, Measurement
-from mcx_jax.envs.lag import LagState
 from mcx_jax.envs.motion import Track
 
 

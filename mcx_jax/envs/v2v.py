@@ -12,19 +12,20 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mcx_jax.batch_last import batch_last
-from mcx_jax.delay import CONTROL_DT_S, SUBSTEPS, Delay
-from mcx_jax.env_config import EnvConfig, MotionConfig
-from mcx_jax.envs import chain, conditions, ik, lag, observe, servo, vessels
-from mcx_jax.envs.arm import load_arm, start_pose
+from mcx_jax.arm import chain, ik, lag, servo
+from mcx_jax.arm.load import load_arm, start_pose
+from mcx_jax.arm.model import ChainModel
+from mcx_jax.compute.batch_last import batch_last
+from mcx_jax.compute.fusion import stage
+from mcx_jax.config.delay import CONTROL_DT_S, SUBSTEPS, Delay
+from mcx_jax.config.task import EnvConfig, MotionConfig
+from mcx_jax.envs import conditions, observe, vessels
 from mcx_jax.envs.conditions import Conditions, Measurement
 from mcx_jax.envs.goal_path import GoalPath, load_goal_path
-from mcx_jax.envs.model import ChainModel
 from mcx_jax.envs.motion import Motion, Track, draw_track, load_motion
 from mcx_jax.envs.state import ArmState, EnvState, Metrics
 from mcx_jax.envs.vessels import Segment
 from mcx_jax.spatial import Mat, Vec, exp_rotation, matmul, matvec, norm, unpack, vadd, vscale
-from mcx_jax.stage import stage
 
 SETTLE_STEPS = 100
 """Physics steps with the vessels held still before an episode (authors' code)."""
@@ -44,7 +45,7 @@ class V2VEnv:
     mjx_model: Any
     """mjx.Model for --physics mjx, else None."""
     wall: jax.Array | None
-    """() bool, true: keeps XLA on CPU from recomputing stages (mcx_jax.stage); None on a GPU."""
+    """() bool, true: keeps XLA on a CPU from recomputing stages (`compute.fusion`); GPU: None."""
     model: ChainModel = struct.field(pytree_node=False)
     config: EnvConfig = struct.field(pytree_node=False)
     known_delay: Delay = struct.field(pytree_node=False)
@@ -282,7 +283,7 @@ class V2VEnv:
 
             q, qd = self._whole(simulate, arm.q, arm.qd, ctrl, seg_a, drawn.plant)
         else:
-            from mcx_jax.envs import mjx_engine
+            from mcx_jax.arm import mjx_engine
 
             base_at = lambda i: vessels.base_state(seg_a, i, self.wall)  # noqa: E731
             advance = partial(mjx_engine.substeps, self.mjx_model, integrator=self.integrator)
@@ -329,7 +330,7 @@ def make_env(
     integrator = model.integrator if config.integrator == "model" else config.integrator
     mjx_model = None
     if config.physics == "mjx":
-        from mcx_jax.envs import mjx_engine
+        from mcx_jax.arm import mjx_engine
 
         mjx_model = mjx_engine.put_model(mj, integrator)
     return V2VEnv(

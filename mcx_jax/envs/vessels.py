@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mcx_jax.delay import SUBSTEPS
+from mcx_jax.compute.fusion import stage
+from mcx_jax.config.delay import SUBSTEPS
 from mcx_jax.envs.motion import Motion, Track
-from mcx_jax.sea.sampler import KNOT_STEPS, body_rates, hermite, segment_rows
+from mcx_jax.envs.sampler import KNOT_STEPS, body_rates, hermite, segment_rows
 from mcx_jax.sea.spectrum import GRAVITY_M_S2
 from mcx_jax.sea.tables import SEPARATION_X_M
 from mcx_jax.spatial import (
@@ -31,7 +32,6 @@ from mcx_jax.spatial import (
     vadd,
     vsub,
 )
-from mcx_jax.stage import stage
 
 REST_B_M: Vec = (SEPARATION_X_M, 0.0, 0.0)
 """Vessel B's rest position (authors' code); vessel A rests at the origin."""
@@ -130,7 +130,7 @@ def goal_pose(
 
     Args:
         goal_m: (3,) position of the goal on vessel B at that step, m.
-        wall: see `mcx_jax.stage`.
+        wall: see `mcx_jax.compute.fusion`.
     """
     seg_a = segment(motion.knots_a, track.table, track.start_a + step, wall)
     seg_b = segment(motion.knots_b, track.table, track.start_b + step, wall)

@@ -5,8 +5,8 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from mcx_jax.envs.model import torque_limits_nm
-from mcx_jax.sharding import env_mesh, put
+from mcx_jax.arm.model import torque_limits_nm
+from mcx_jax.compute.sharding import env_mesh, put
 
 
 def run_episodes(env, controller, keys, seas, gain, given=None):
@@ -14,7 +14,7 @@ def run_episodes(env, controller, keys, seas, gain, given=None):
 
     Args:
         env: V2VEnv.
-        controller: see mcx_jax.controllers.
+        controller: see mcx_jax.controllers.classical.
         keys: (N,) PRNG keys.
         seas: (N,) int32 sea index per episode.
         gain: (N,) factor of the controller's actions: 0 makes an episode one of the IK baseline, so

@@ -5,7 +5,7 @@ import functools
 from dataclasses import replace
 
 from mcx_jax.assets import asset_path
-from mcx_jax.env_config import COUPLED, ConditionsConfig, EnvConfig, MotionConfig
+from mcx_jax.config.task import COUPLED, ConditionsConfig, EnvConfig, MotionConfig
 
 
 @functools.cache

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from mcx_jax.delay import CONTROL_DT_S
+from mcx_jax.config.delay import CONTROL_DT_S
 from mcx_jax.errors import UserError
-from mcx_jax.paper import table3
+from mcx_jax.evaluation.paper import table3
 
 WARM_UP_STEPS = 50
 """The first second of every episode is dropped (paper)."""

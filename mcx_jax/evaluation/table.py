@@ -4,14 +4,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TextIO
 
-from mcx_jax import terminal
-from mcx_jax.env_config import EnvConfig, MotionConfig
-from mcx_jax.paper import is_papers_world
-from mcx_jax.results import paper_errors
-from mcx_jax.roster import WHO
+from mcx_jax.config.task import EnvConfig, MotionConfig
+from mcx_jax.console import terminal
+from mcx_jax.controllers.by_name import WHO
+from mcx_jax.evaluation.paper import is_papers_world
+from mcx_jax.evaluation.statistics import paper_errors
 
 Row = dict[str, Any]
-"""One result row, as `mcx_jax.results` makes them; see the README, section Commands."""
+"""One result row of `mcx_jax.evaluation.statistics`; docs/commands.md lists its fields."""
 
 PAPER_NOTE = (
     "paper: table 3's mean error of the paper's trained agents; with ~, for ik, of the baseline "

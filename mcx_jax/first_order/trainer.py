@@ -17,11 +17,11 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mcx_jax.config import TrainConfig
-from mcx_jax.envs.chain import SMOOTH
+from mcx_jax.arm.chain import SMOOTH
+from mcx_jax.config.training import TrainConfig
+from mcx_jax.policy.networks import init_params, step
+from mcx_jax.policy.normalise import RunningStats, init_stats, merge, normalise_obs
 from mcx_jax.ppo.loss import reported_mean
-from mcx_jax.ppo.networks import init_params, step
-from mcx_jax.ppo.normalise import RunningStats, init_stats, merge, normalise_obs
 from mcx_jax.ppo.rollout import Actors, init_actors, insert_block, replace_broken, step_all
 from mcx_jax.ppo.trainer import learning_rate, networks_of
 from mcx_jax.ppo.update import Fitted, gradient_step, init_fitted

@@ -1,7 +1,7 @@
 """The task for learners that are not written in JAX, as Gymnasium environments.
 
     import gymnasium
-    import mcx_jax.gym  # registers the name
+    import mcx_jax.integrations.gym  # registers the name
 
     one = gymnasium.make("mcx_jax/V2V-v0", delay="E2", sea="Wd")
     many = gymnasium.make_vec("mcx_jax/V2V-v0", num_envs=512, delay="E2")
@@ -37,7 +37,7 @@ try:
 except ModuleNotFoundError as error:
     from mcx_jax import extras
 
-    raise ModuleNotFoundError(extras.missing("gymnasium", "mcx_jax.gym")) from error
+    raise ModuleNotFoundError(extras.missing("gymnasium", "mcx_jax.integrations.gym")) from error
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -45,13 +45,13 @@ from flax import struct
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from mcx_jax.cli import checked_value
-from mcx_jax.delay import CONTROL_DT_S
-from mcx_jax.env_config import ConditionsConfig, EnvConfig, MotionConfig
+from mcx_jax.config.command_line import checked_value
+from mcx_jax.config.delay import CONTROL_DT_S
+from mcx_jax.config.task import ConditionsConfig, EnvConfig, MotionConfig
 from mcx_jax.envs.state import EnvState
 from mcx_jax.envs.v2v import V2VEnv, make_env
 from mcx_jax.errors import UserError
-from mcx_jax.playground import finite_step
+from mcx_jax.integrations.playground import finite_step
 
 ENV_ID = "mcx_jax/V2V-v0"
 REGISTERED_STEPS = EnvConfig().episode_steps
@@ -478,7 +478,7 @@ def _masked(info: dict[str, Any], mask: np.ndarray) -> dict[str, Any]:
 
 gymnasium.register(
     ENV_ID,
-    entry_point="mcx_jax.gym:V2V",
-    vector_entry_point="mcx_jax.gym:V2VVector",
+    entry_point="mcx_jax.integrations.gym:V2V",
+    vector_entry_point="mcx_jax.integrations.gym:V2VVector",
     max_episode_steps=REGISTERED_STEPS,
 )

@@ -1,6 +1,6 @@
 """The numbers of a serial hinge arm in an `mjx.Model`, as the chain engine takes them.
 
-What is concrete becomes Python floats, what is traced stays traced (`mcx_jax.mjx_step`).
+Concrete numbers become Python floats, traced ones stay traced (`mcx_jax.integrations.mjx_step`).
 """
 
 from dataclasses import dataclass, fields
@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from mcx_jax.envs import dynamics
-from mcx_jax.envs.fields import integrator, refuse_unsupported
-from mcx_jax.envs.model import ChainModel, Link
+from mcx_jax.arm import dynamics
+from mcx_jax.arm.fields import integrator, refuse_unsupported
+from mcx_jax.arm.model import ChainModel, Link
+from mcx_jax.arm.quiet_mjx import mjx
 from mcx_jax.errors import require
-from mcx_jax.quiet_mjx import mjx
 from mcx_jax.spatial import (
     EYE,
     ZERO,
@@ -146,7 +146,7 @@ def _refuse_hidden_armature(m: mjx.Model, model: ChainModel) -> None:
         np.allclose(diagonal, m.dof_M0, rtol=1e-4),  # sums of float32 numbers, rounded at 6e-8 each
         "mjx_step: dof_M0 is not that of the masses: actuators have armature, which mjx.put_model "
         "drops, or numbers were changed after compilation; put the model with "
-        "mcx_jax.mjx_step.put_model",
+        "mcx_jax.integrations.mjx_step.put_model",
     )
 
 

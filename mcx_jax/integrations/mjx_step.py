@@ -1,7 +1,7 @@
 """`mjx.step` for serial hinge arms, computed by the chain engine: change one import.
 
-    from mcx_jax.mjx_step import step
-    m = mcx_jax.mjx_step.put_model(mj)  # or mjx.put_model
+    from mcx_jax.integrations.mjx_step import step
+    m = mcx_jax.integrations.mjx_step.put_model(mj)  # or mjx.put_model
 
 The model's numbers are read from `mjx.Model` while tracing. What is concrete (a model closed over,
 the usual case) becomes Python floats, whose zeros and ones vanish from the program; what is traced
@@ -16,12 +16,12 @@ import mujoco
 import numpy as np
 from jax.core import Tracer
 
-from mcx_jax.envs import dynamics
-from mcx_jax.envs.fields import refuse_unsupported
-from mcx_jax.envs.mjx_engine import on_device
-from mcx_jax.envs.model import with_joints_carrying_servos
-from mcx_jax.mjx_model import Arm, compose, read
-from mcx_jax.quiet_mjx import mjx
+from mcx_jax.arm import dynamics
+from mcx_jax.arm.fields import refuse_unsupported
+from mcx_jax.arm.mjx_engine import on_device
+from mcx_jax.arm.model import with_joints_carrying_servos
+from mcx_jax.arm.quiet_mjx import mjx
+from mcx_jax.integrations.mjx_model import Arm, compose, read
 from mcx_jax.spatial import (
     EYE,
     ZERO,

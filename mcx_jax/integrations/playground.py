@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mcx_jax.delay import CONTROL_DT_S, PHYSICS_DT_S, SUBSTEPS
-from mcx_jax.env_config import EnvConfig, MotionConfig
+from mcx_jax.config.delay import CONTROL_DT_S, PHYSICS_DT_S, SUBSTEPS
+from mcx_jax.config.task import EnvConfig, MotionConfig
 from mcx_jax.envs.state import EnvState
 from mcx_jax.envs.v2v import V2VEnv, make_env
 

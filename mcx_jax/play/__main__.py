@@ -4,7 +4,7 @@ WHO is whatever `evaluate` takes; ik is always beside it.
 """
 
 if __name__ == "__main__":
-    from mcx_jax.command import begin
+    from mcx_jax.console.command import begin
 
     begin()
 
@@ -16,10 +16,10 @@ from typing import Annotated, Literal
 
 import tyro
 
-from mcx_jax.command import interruptible
-from mcx_jax.config import check_seed
-from mcx_jax.delay import CONTROL_DT_S
-from mcx_jax.env_config import EnvConfig, MotionConfig
+from mcx_jax.config.delay import CONTROL_DT_S
+from mcx_jax.config.task import EnvConfig, MotionConfig
+from mcx_jax.config.training import check_seed
+from mcx_jax.console.command import interruptible
 from mcx_jax.errors import UserError
 
 
@@ -75,15 +75,17 @@ class PlayConfig:
 
 def main(argv: list[str] | None = None) -> None:
     """Command line."""
-    from mcx_jax import cli, extras, startup
+    from mcx_jax import extras
+    from mcx_jax.compute import startup
+    from mcx_jax.config import command_line
+    from mcx_jax.controllers.by_name import fit_if_needed
     from mcx_jax.report import entries
-    from mcx_jax.roster import fit_if_needed
 
     argv = list(sys.argv[1:] if argv is None else argv)
-    config = cli.parse(PlayConfig, argv, prog="play")
+    config = command_line.parse(PlayConfig, argv, prog="play")
     (name,) = entries.check_names([config.who])[-1:]
-    cli.check_output("--video", config.video)
-    cli.check_output("--frame", config.frame)
+    command_line.check_output("--video", config.video)
+    command_line.check_output("--frame", config.frame)
     extras.require("imageio_ffmpeg" if config.video else "PIL" if config.frame else "viser", "play")
     if config.to_file:
         from mcx_jax.play import gl
@@ -95,7 +97,7 @@ def main(argv: list[str] | None = None) -> None:
     own = dataclasses.replace(EnvConfig(), **entries.common_settings([entry], argv))
     # Again, with the policy's own task as the defaults.
     who = PlayConfig(who=config.who, env=own)
-    config = cli.parse(PlayConfig, argv, prog="play", default=who)
+    config = command_line.parse(PlayConfig, argv, prog="play", default=who)
     print(config.env.describe_delays(), flush=True)
     if entry.controller is None:
         fitted = fit_if_needed(entry.who, None, config.env, config.motion, "")
@@ -139,6 +141,6 @@ def to_file(config: PlayConfig, entry) -> None:
 
 
 if __name__ == "__main__":
-    from mcx_jax.startup import run_command
+    from mcx_jax.compute.startup import run_command
 
     run_command(main)

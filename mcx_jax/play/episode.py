@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from mcx_jax.delay import CONTROL_DT_S, PHYSICS_DT_S, SUBSTEPS
+from mcx_jax.config.delay import CONTROL_DT_S, PHYSICS_DT_S, SUBSTEPS
 from mcx_jax.envs import vessels
 from mcx_jax.envs.motion import Motion, Track
 from mcx_jax.envs.state import EnvState

@@ -5,13 +5,13 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from mcx_jax.delay import CONTROL_DT_S
-from mcx_jax.env_config import MotionConfig
+from mcx_jax.config.delay import CONTROL_DT_S
+from mcx_jax.config.task import MotionConfig
 from mcx_jax.envs.state import EnvState
 from mcx_jax.envs.v2v import V2VEnv
 from mcx_jax.play.episode import Poses, Take, name_delay, poses_now
 from mcx_jax.play.picture import INK, panel
-from mcx_jax.play.stage import Painter, Stage
+from mcx_jax.play.renderer import Painter, Stage
 from mcx_jax.play.waves import surface
 
 SIZE_PX = (640, 360)

@@ -8,8 +8,8 @@ import numpy as np
 import trimesh
 import viser
 
-from mcx_jax.play.stage import CLOSE_UP, Stage
-from mcx_jax.scene import water_level_m
+from mcx_jax.play.renderer import CLOSE_UP, Stage
+from mcx_jax.play.scene import water_level_m
 
 View = tuple[Any, Any]
 """A camera's position and what it looks at, page axes, m."""

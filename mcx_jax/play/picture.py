@@ -7,7 +7,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from mcx_jax import palette
 from mcx_jax.play.episode import Take
-from mcx_jax.play.stage import Painter, Stage
+from mcx_jax.play.renderer import Painter, Stage
 from mcx_jax.play.waves import Surface
 
 WIDTH_PX, HEIGHT_PX = 1280, 720

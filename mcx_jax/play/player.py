@@ -12,16 +12,16 @@ import viser
 
 from mcx_jax import palette
 from mcx_jax.assets import SHIPPED, asset_path
-from mcx_jax.delay import CONTROL_DT_S, NAMED_DELAYS
+from mcx_jax.config.delay import CONTROL_DT_S, NAMED_DELAYS
+from mcx_jax.controllers.by_name import FITTED, WHO, fit_if_needed
 from mcx_jax.envs.v2v import V2VEnv, make_env
 from mcx_jax.errors import UserError, reason
 from mcx_jax.play.episode import EPISODES, Take, describe_sea, simulate
 from mcx_jax.play.page import Tableau, View, add_light, aim, look_at, overview
 from mcx_jax.play.picture import MUTED
-from mcx_jax.play.stage import Stage
+from mcx_jax.play.renderer import Stage
 from mcx_jax.play.waves import Surface, surface
 from mcx_jax.report.entries import load_entries
-from mcx_jax.roster import FITTED, WHO, fit_if_needed
 
 STRIDE = 2
 """Control steps from one picture to the next: 25 a second."""

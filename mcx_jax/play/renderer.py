@@ -7,13 +7,12 @@ import mujoco
 import numpy as np
 from PIL import Image
 
+from mcx_jax.arm.model import ARMS
 from mcx_jax.assets import asset_path
-from mcx_jax.env_config import EnvConfig
-from mcx_jax.envs.model import ARMS
+from mcx_jax.config.task import EnvConfig
 from mcx_jax.play import gl
 from mcx_jax.play.episode import Poses
-from mcx_jax.play.waves import Surface
-from mcx_jax.scene import (
+from mcx_jax.play.scene import (
     below_decks_m,
     build_scene,
     pose_scene,
@@ -21,6 +20,7 @@ from mcx_jax.scene import (
     set_sea,
     water_level_m,
 )
+from mcx_jax.play.waves import Surface
 
 CLOSE_UP = (0.24, 75.0, 12.0)
 """The close-up's camera about the goal: distance m, azimuth and elevation deg. From below, since

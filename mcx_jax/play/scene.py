@@ -10,8 +10,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from mcx_jax.arm.load import START_POSE_RAD
 from mcx_jax.assets import asset_path
-from mcx_jax.envs.arm import START_POSE_RAD
 
 HULL_M = (0.24, -1.0, 0.35)
 """Outline of the hulls in `assets/scene.xml`, vessel axes: blunt end with its fender, middle of the

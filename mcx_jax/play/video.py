@@ -9,12 +9,12 @@ from typing import IO
 
 import numpy as np
 
-from mcx_jax.delay import CONTROL_DT_S
-from mcx_jax.env_config import EnvConfig, MotionConfig
+from mcx_jax.config.delay import CONTROL_DT_S
+from mcx_jax.config.task import EnvConfig, MotionConfig
 from mcx_jax.errors import UserError, reason
 from mcx_jax.play.episode import Take, describe_sea
 from mcx_jax.play.picture import HEIGHT_PX, WIDTH_PX, Picture
-from mcx_jax.play.stage import Painter, Stage
+from mcx_jax.play.renderer import Painter, Stage
 from mcx_jax.play.waves import surface
 
 STRIDE = 2

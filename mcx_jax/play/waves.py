@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from mcx_jax.env_config import MotionConfig
+from mcx_jax.config.task import MotionConfig
 from mcx_jax.play.episode import Take
 from mcx_jax.sea.hydro import VesselKnobs
 from mcx_jax.sea.spectrum import GRAVITY_M_S2, parse_sea

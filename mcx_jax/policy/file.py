@@ -2,8 +2,8 @@
 
 The file is a plain `.npz` without pickles: weights under their names (`policy/net/head/kernel`),
 the observation statistics, and two JSON strings: `metadata` (format version, network, configuration
-of the training run) and `interface` (`mcx_jax.interface`: what goes in and out, names, units,
-frames). NumPy alone reads it; `mcx_jax.numpy_policy` runs it.
+of the training run) and `interface` (`mcx_jax.policy.interface`: inputs and outputs, their names,
+units and frames). NumPy alone reads it; `mcx_jax.policy.numpy_policy` runs it.
 """
 
 import dataclasses
@@ -18,13 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct, traverse_util
 
-from mcx_jax import interface
 from mcx_jax.assets import policy_file
 from mcx_jax.envs.observe import OBS_SIZE
 from mcx_jax.errors import UserError
-from mcx_jax.ppo.networks import CELLS, Carry, Params, PolicyNet, init_params, step
-from mcx_jax.ppo.networks import init_carry as zero_carry
-from mcx_jax.ppo.normalise import RunningStats, init_stats, normalise_obs
+from mcx_jax.policy import interface
+from mcx_jax.policy.networks import CELLS, Carry, Params, PolicyNet, init_params, step
+from mcx_jax.policy.networks import init_carry as zero_carry
+from mcx_jax.policy.normalise import RunningStats, init_stats, normalise_obs
 
 FORMAT = 1
 """Version of the file."""
@@ -103,7 +103,7 @@ def act(policy: Policy, carry: Carry, obs: jax.Array) -> tuple[Carry, jax.Array]
 
 @struct.dataclass
 class PolicyController:
-    """A policy with the two functions of a controller (`mcx_jax.controllers`), for ONE episode."""
+    """A policy with the two functions of a controller (`controllers.classical`), ONE episode."""
 
     policy: Policy
 

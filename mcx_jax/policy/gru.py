@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mcx_jax.ppo.dense import affine
-from mcx_jax.ppo.lstm import orthogonal_blocks
+from mcx_jax.policy.dense import affine
+from mcx_jax.policy.lstm import orthogonal_blocks
 
 
 @struct.dataclass

@@ -8,11 +8,11 @@ from typing import Any
 
 import jax
 
-from mcx_jax.delay import CONTROL_DT_S, parse_delay
+from mcx_jax.config.delay import CONTROL_DT_S, parse_delay
 from mcx_jax.envs.observe import AGE, OBS_SIZE, OBS_TABLE, ObservationRow
 from mcx_jax.errors import UserError
-from mcx_jax.ppo.networks import PolicyNet, init_carry
-from mcx_jax.ppo.normalise import CLIP, STD_FLOOR
+from mcx_jax.policy.networks import PolicyNet, init_carry
+from mcx_jax.policy.normalise import CLIP, STD_FLOOR
 
 FRAMES = (
     "I inertial, B arm base, E tool, G goal; R_B_G, p_B_G: orientation (maps coordinates in G to "

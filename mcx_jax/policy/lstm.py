@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mcx_jax.ppo.dense import affine, kernel_gradient
-from mcx_jax.stage import opaque_true, stage
+from mcx_jax.compute.fusion import opaque_true, stage
+from mcx_jax.policy.dense import affine, kernel_gradient
 
 NEWTON_SCHULZ_STEPS = 60
 """Enough for singular values down to 1e-9 of the largest."""

@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mcx_jax.ppo.dense import Dense
-from mcx_jax.ppo.gru import GRU
-from mcx_jax.ppo.lstm import LSTM
+from mcx_jax.policy.dense import Dense
+from mcx_jax.policy.gru import GRU
+from mcx_jax.policy.lstm import LSTM
 
 Params = Any
 """A network's weights, as flax nests them."""

@@ -12,7 +12,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from mcx_jax.errors import UserError
-from mcx_jax.policy import Policy, named_arrays
+from mcx_jax.policy.file import Policy, named_arrays
 
 OPSET = 17
 IR_VERSION = 8
@@ -52,7 +52,7 @@ Weights = dict[str, np.ndarray]
 
 
 def lstm(graph: Graph, weights: Weights, x: str) -> str:
-    """`mcx_jax.ppo.lstm` (gates input, forget, cell, output): inputs c, h; outputs c_next, h_next.
+    """`policy.lstm` (gates input, forget, cell, output): inputs c, h; outputs c_next, h_next.
 
     Returns:
         The cell's output.
@@ -68,7 +68,7 @@ def lstm(graph: Graph, weights: Weights, x: str) -> str:
 
 
 def gru(graph: Graph, weights: Weights, x: str) -> str:
-    """`mcx_jax.ppo.gru` (gates reset, update, candidate): input h; output h_next.
+    """`mcx_jax.policy.gru` (gates reset, update, candidate): input h; output h_next.
 
     Returns:
         The cell's output.

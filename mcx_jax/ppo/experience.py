@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mcx_jax.config import PPOConfig
+from mcx_jax.config.training import PPOConfig
+from mcx_jax.policy.networks import Carry, Networks, Params, step, unroll
+from mcx_jax.policy.normalise import RunningStats, denormalise, normalise, normalise_obs
 from mcx_jax.ppo.gae import discounted_returns, gae
 from mcx_jax.ppo.loss import explained_variance, standardise
-from mcx_jax.ppo.networks import Carry, Networks, Params, step, unroll
-from mcx_jax.ppo.normalise import RunningStats, denormalise, normalise, normalise_obs
 from mcx_jax.ppo.rollout import Window
 from mcx_jax.ppo.sequences import flatten_starts, to_sequences
 

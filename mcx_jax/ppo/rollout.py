@@ -25,10 +25,10 @@ import jax.numpy as jnp
 from flax import struct
 from jax.sharding import Mesh
 
-from mcx_jax.ppo.gaussian import action_distribution
-from mcx_jax.ppo.networks import Carry, Networks, Params, init_carry, step
-from mcx_jax.ppo.normalise import RunningStats, normalise_obs
-from mcx_jax.sharding import over_envs, shardings
+from mcx_jax.compute.sharding import over_envs, shardings
+from mcx_jax.policy.gaussian import action_distribution
+from mcx_jax.policy.networks import Carry, Networks, Params, init_carry, step
+from mcx_jax.policy.normalise import RunningStats, normalise_obs
 
 
 @struct.dataclass

@@ -5,7 +5,7 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 
-from mcx_jax.sharding import over_envs
+from mcx_jax.compute.sharding import over_envs
 
 Tree = TypeVar("Tree")
 

@@ -1,4 +1,4 @@
-"""One training iteration, rollout and learning in one pure function (run by `mcx_jax.programs`).
+"""One training iteration, rollout and learning in one pure function (run by `runs.programs`).
 
 `env` is an argument (it holds the sea's tables; closed over, they would be baked into the program).
 Several seeds are an outer `vmap` over the state.
@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mcx_jax.config import PPOConfig, TrainConfig
+from mcx_jax.config.training import PPOConfig, TrainConfig
+from mcx_jax.policy.networks import Networks, init_params, make_networks
+from mcx_jax.policy.normalise import RunningStats, init_stats, merge
 from mcx_jax.ppo.experience import Judged, judge
 from mcx_jax.ppo.loss import masked_mean, reported_mean
-from mcx_jax.ppo.networks import Networks, init_params, make_networks
-from mcx_jax.ppo.normalise import RunningStats, init_stats, merge
 from mcx_jax.ppo.rollout import Actors, Window, collect, init_actors, insert_block, replace_broken
 from mcx_jax.ppo.update import Learner, UpdateStats, init_fitted, learn
 

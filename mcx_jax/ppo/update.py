@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from mcx_jax.config import PPOConfig
+from mcx_jax.config.training import PPOConfig
+from mcx_jax.policy.gaussian import action_distribution
+from mcx_jax.policy.networks import Networks, Params, unroll
 from mcx_jax.ppo.experience import Batch
-from mcx_jax.ppo.gaussian import action_distribution
 from mcx_jax.ppo.loss import SurrogateStats, clipped_surrogate, value_loss
-from mcx_jax.ppo.networks import Networks, Params, unroll
 from mcx_jax.ppo.sequences import minibatch_order, take
 
 KL_STOP_FACTOR = 1.5

@@ -4,7 +4,7 @@ RUN is what `evaluate` takes; ik is always there.
 """
 
 if __name__ == "__main__":
-    from mcx_jax.command import begin
+    from mcx_jax.console.command import begin
 
     begin()
 
@@ -15,8 +15,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from mcx_jax import cli
-from mcx_jax.env_config import EnvConfig, MotionConfig
+from mcx_jax.config import command_line
+from mcx_jax.config.task import EnvConfig, MotionConfig
 from mcx_jax.errors import UserError
 from mcx_jax.evaluate import EvaluateConfig
 from mcx_jax.report.folder import PAGE, check_out, write
@@ -52,11 +52,12 @@ class ReportConfig:
 
 def main(argv: list[str] | None = None) -> None:
     """Command line."""
-    from mcx_jax import extras, startup
+    from mcx_jax import extras
+    from mcx_jax.compute import startup
     from mcx_jax.report import entries
 
     argv = list(sys.argv[1:] if argv is None else argv)
-    config = cli.parse(ReportConfig, argv, prog="report")
+    config = command_line.parse(ReportConfig, argv, prog="report")
     names = entries.check_names(config.runs)
     out = check_out(config.out)
     extras.require("matplotlib", "report")
@@ -65,7 +66,7 @@ def main(argv: list[str] | None = None) -> None:
     loaded = entries.load_entries(names)
     own = dataclasses.replace(EnvConfig(), **entries.common_settings(loaded, argv))
     # Again, with the runs' own task as the defaults.
-    config = cli.parse(ReportConfig, argv, prog="report", default=ReportConfig(env=own))
+    config = command_line.parse(ReportConfig, argv, prog="report", default=ReportConfig(env=own))
     print(config.env.describe_delays())
 
     from mcx_jax.report.build import build
@@ -76,6 +77,6 @@ def main(argv: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    from mcx_jax.startup import run_command
+    from mcx_jax.compute.startup import run_command
 
     run_command(main)

@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from mcx_jax import machine
-from mcx_jax.delay import CONTROL_DT_S
-from mcx_jax.envs.model import torque_limits_nm
+from mcx_jax.arm.model import torque_limits_nm
+from mcx_jax.compute import machine
+from mcx_jax.config.delay import CONTROL_DT_S
+from mcx_jax.controllers.by_name import fit_if_needed
 from mcx_jax.evaluate import Errors, errors_beside_ik, evaluation_env, rows_beside_ik
+from mcx_jax.evaluation.paper import is_papers_world, table3
 from mcx_jax.palette import controllers
-from mcx_jax.paper import is_papers_world, table3
 from mcx_jax.report import sections, style
 from mcx_jax.report.entries import Entry, learning_curves
 from mcx_jax.report.episode import record
@@ -24,7 +25,6 @@ from mcx_jax.report.page import page
 from mcx_jax.report.sections import Section
 from mcx_jax.report.spectra import motion_spectra
 from mcx_jax.report.table import table
-from mcx_jax.roster import fit_if_needed
 
 UNITS = ("pos_mm", "ang_mrad")
 Rows = dict[str, list[dict[str, Any]]]

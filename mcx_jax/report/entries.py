@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from mcx_jax import cli
+from mcx_jax.config import command_line
+from mcx_jax.controllers.by_name import load_controller, policy_path
 from mcx_jax.errors import UserError, printable
-from mcx_jax.roster import load_controller, policy_path
-from mcx_jax.run_dir import METRICS, whole_rows
+from mcx_jax.runs.run_dir import METRICS, whole_rows
 
 OWN_SETTINGS = ("delay", "arm", "tool_site", "integrator")
 """What a policy was trained for and is reported in, unless the command line says otherwise. Not
@@ -107,7 +107,7 @@ def common_settings(entries: Sequence[Entry], argv: Sequence[str]) -> dict[str, 
     for name in OWN_SETTINGS:
         flag = "--" + name.replace("_", "-")
         by_entry = {e.label: e.settings[name] for e in entries if name in e.settings}
-        if len(set(by_entry.values())) > 1 and cli.value_of(argv, flag) is None:
+        if len(set(by_entry.values())) > 1 and command_line.value_of(argv, flag) is None:
             said = ", ".join(f"{label} {value}" for label, value in by_entry.items())
             raise UserError(f"the runs differ in {flag} ({said}); choose one with {flag}")
         if by_entry:

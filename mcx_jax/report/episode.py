@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from mcx_jax.delay import CONTROL_DT_S
-from mcx_jax.envs import ik
+from mcx_jax.arm import ik
+from mcx_jax.config.delay import CONTROL_DT_S
 from mcx_jax.envs.state import EnvState
 from mcx_jax.envs.v2v import V2VEnv
 from mcx_jax.spatial import unpack

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from mcx_jax import cli
+from mcx_jax.config import command_line
 from mcx_jax.errors import UserError, reason
 
 PAGE, RESULTS = "index.html", "results.json"
@@ -26,7 +26,7 @@ def check_out(out: str) -> Path:
     if not out:
         raise UserError("--out is missing: name a directory for the report")
     path = Path(out)
-    cli.check_name("--out", path)
+    command_line.check_name("--out", path)
     if path.exists() and not path.is_dir():
         raise UserError(f"--out {out}: is a file; name a directory")
     # Before minutes of evaluation, not after.

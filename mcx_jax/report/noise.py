@@ -13,8 +13,8 @@ import numpy as np
 
 from mcx_jax.envs import conditions
 from mcx_jax.envs.v2v import V2VEnv
-from mcx_jax.episodes import run_everywhere
-from mcx_jax.results import WARM_UP_STEPS, finite_episodes
+from mcx_jax.evaluation.episodes import run_everywhere
+from mcx_jax.evaluation.statistics import WARM_UP_STEPS, finite_episodes
 
 LEVELS = (0.0, 0.3, 1.0, 3.0)
 """Standard deviation of each axis, mm, and about each axis, mrad: the same number of both."""

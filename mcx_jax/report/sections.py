@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from mcx_jax import palette
 from mcx_jax.evaluate import Errors
+from mcx_jax.evaluation.statistics import WARM_UP_STEPS, finite_episodes, paper_errors
 from mcx_jax.report import figures, style
 from mcx_jax.report.entries import Curves
 from mcx_jax.report.episode import Episode, lag_s
@@ -16,7 +17,6 @@ from mcx_jax.report.figures import Line
 from mcx_jax.report.noise import Sweep
 from mcx_jax.report.spectra import CHANNELS, UNITS, Spectrum
 from mcx_jax.report.table import noise_table
-from mcx_jax.results import WARM_UP_STEPS, finite_episodes, paper_errors
 
 ZOOM_S = 0.6
 """What the follow panels show: short enough for a delay of 40 ms to be seen."""

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from mcx_jax.paper import table3
+from mcx_jax.evaluation.paper import table3
+from mcx_jax.evaluation.statistics import GROUPS
 from mcx_jax.report.noise import Sweep
-from mcx_jax.results import GROUPS
 
 _GROUPS = ("all", "5 %", "1 %", "max")
 """The mean of all points, of the worst 5 % and 1 %, and the maximum."""

@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from mcx_jax import hosts
+from mcx_jax.compute import processes
 from mcx_jax.errors import UserError, reason
 
 FORMAT = 3
@@ -45,7 +45,7 @@ class _Refused(Exception):
 def save(run_dir: Path, iteration: int, state: Any, config: str = "") -> None:
     """Write the state after `iteration` iterations; whole or not at all, and only once.
 
-    Of several processes (`mcx_jax.hosts`) all have to call this, and the first one writes.
+    Of several processes (`mcx_jax.compute.processes`) all must call this, and the first one writes.
 
     Args:
         config: the run's configuration (`cli.config_to_json`).
@@ -54,8 +54,8 @@ def save(run_dir: Path, iteration: int, state: Any, config: str = "") -> None:
         UserError: it cannot be written; the checkpoints that were there still are.
     """
     folder = (run_dir / FOLDER).absolute()
-    flat = hosts.whole(flatten(state))
-    if not hosts.first() or latest(run_dir) == iteration:
+    flat = processes.whole(flatten(state))
+    if not processes.first() or latest(run_dir) == iteration:
         return
     partial = folder / f".{iteration}.partial"
     try:

@@ -13,14 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mcx_jax import checkpoint, hosts
-from mcx_jax.config import TrainConfig
+from mcx_jax.compute import processes
+from mcx_jax.config.training import TrainConfig
 from mcx_jax.errors import UserError, reason
-from mcx_jax.ppo.networks import step
-from mcx_jax.ppo.normalise import normalise_obs
+from mcx_jax.policy.networks import step
+from mcx_jax.policy.normalise import normalise_obs
 from mcx_jax.ppo.trainer import networks_of
-from mcx_jax.progress import LEFT_OUT
-from mcx_jax.run_dir import RunDir
+from mcx_jax.runs import checkpoint
+from mcx_jax.runs.progress import LEFT_OUT
+from mcx_jax.runs.run_dir import RunDir
 
 LIMIT = 10
 """Lost iterations in a row that end a run."""
@@ -113,4 +114,4 @@ def states(config: TrainConfig, before: Any, after: Any) -> dict[str, np.ndarray
         if state is not None:
             flat[f"{name}.action"] = act(state)
             flat |= {name + path: leaf for path, leaf in checkpoint.flatten(state).items()}
-    return hosts.whole(flat)
+    return processes.whole(flat)

@@ -10,19 +10,22 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from mcx_jax import checkpoint, cli, command, hosts, streams, tensorboard
-from mcx_jax.config import TrainConfig
-from mcx_jax.env_config import EnvConfig, MotionConfig
+from mcx_jax.compute import processes
+from mcx_jax.config import command_line
+from mcx_jax.config.task import EnvConfig, MotionConfig
+from mcx_jax.config.training import TrainConfig
+from mcx_jax.console import command, streams
+from mcx_jax.console.terminal import working
 from mcx_jax.errors import UserError
-from mcx_jax.progress import Progress, short_time
-from mcx_jax.run_dir import CONFIG, POLICY, RunDir, writing
-from mcx_jax.stop import StopRequest
-from mcx_jax.terminal import working
+from mcx_jax.runs import checkpoint, tensorboard
+from mcx_jax.runs.progress import Progress, short_time
+from mcx_jax.runs.run_dir import CONFIG, POLICY, RunDir, writing
+from mcx_jax.runs.stop import StopRequest
 
 if TYPE_CHECKING:
-    from mcx_jax.policy import Policy
+    from mcx_jax.policy.file import Policy
     from mcx_jax.ppo.trainer import IterationMetrics, TrainState
-    from mcx_jax.programs import Training
+    from mcx_jax.runs.programs import Training
 
 
 def metric_rows(
@@ -49,7 +52,7 @@ def policies_of(config: TrainConfig, state: "TrainState") -> "list[Policy]":
     """The policy of every seed."""
     import jax
 
-    from mcx_jax.policy import Policy, PolicyMeta
+    from mcx_jax.policy.file import Policy, PolicyMeta
 
     arrays = jax.device_get((state.learner.policy.params, state.obs_stats, state.iteration))
     if config.seeds == 1:
@@ -63,7 +66,7 @@ def policies_of(config: TrainConfig, state: "TrainState") -> "list[Policy]":
             action_size=actions,
             hidden=config.ppo.hidden,
             cell=config.ppo.cell,
-            config=cli.config_to_json(config),
+            config=command_line.config_to_json(config),
             iteration=int(iteration),
             seed=config.seed + k,
         )
@@ -85,13 +88,13 @@ def save(run: RunDir, state: "TrainState", rows: list[dict[str, Any]]) -> "tuple
         return _save(run, state, rows)
     except UserError:
         # Alone, since all processes have to take part in a checkpoint.
-        if not (hosts.alone() and run.follow()):
+        if not (processes.alone() and run.follow()):
             raise
         return _save(run, state, rows)  # the directory was moved meanwhile
 
 
 def _save(run: RunDir, state: "TrainState", rows: list[dict[str, Any]]) -> "tuple[Policy, int]":
-    from mcx_jax.policy import save_policy
+    from mcx_jax.policy.file import save_policy
 
     policies = policies_of(run.config, state)
     rewards = {row["seed"]: row["reward"] for row in rows if math.isfinite(row["reward"])}
@@ -103,7 +106,7 @@ def _save(run: RunDir, state: "TrainState", rows: list[dict[str, Any]]) -> "tupl
                     save_policy(run.path / f"policy_s{policy.meta.seed}.npz", policy)
             save_policy(run.path / POLICY, policies[best])
     # Last: a run killed before goes on from the checkpoint before, and writes the policies again.
-    config = cli.config_to_json(run.config)
+    config = command_line.config_to_json(run.config)
     checkpoint.save(run.path, policies[0].meta.iteration, state, config)
     return policies[best], policies[best].meta.seed
 
@@ -124,7 +127,7 @@ def iterate(
     Raises:
         UserError: training has diverged, or the directory cannot be written.
     """
-    from mcx_jax.divergence import Watch
+    from mcx_jax.runs.divergence import Watch
 
     config, progress = run.config, Progress(run.config, run.start_iteration)
     progress.begin()
@@ -141,7 +144,7 @@ def iterate(
         progress.show(rows)
         watch.after_iteration(state, rows)
         overdue = moved or time.monotonic() - saved > checkpoint_interval_s
-        signum, overdue = hosts.agree(stop.signum, overdue)
+        signum, overdue = processes.agree(stop.signum, overdue)
         if signum:  # not stored unless there is one: a signal that came meanwhile is kept
             stop.signum = signum
             break
@@ -165,7 +168,7 @@ def first_policy(config: TrainConfig, env: Any) -> "Policy | None":
     """
     if not config.start_from:
         return None
-    from mcx_jax.policy import load_run
+    from mcx_jax.policy.file import load_run
 
     policy = load_run(config.start_from)
     meta, ppo = policy.meta, config.ppo
@@ -199,8 +202,8 @@ def train(
             diverges.
         SystemExit: stopped by a signal, after saving.
     """
-    run.writes = hosts.first()
-    with hosts.together(run.path), run.held():
+    run.writes = processes.first()
+    with processes.together(run.path), run.held():
         return _train(run, make_env, events and run.writes, checkpoint_interval_s)
 
 
@@ -212,7 +215,7 @@ def _train(
     if config.iterations * config.steps_per_iteration != config.total_steps:
         print(rounded_up(config))
     with working("preparing the vessels' motion") as say:
-        from mcx_jax.programs import prepare
+        from mcx_jax.runs.programs import prepare
 
         env = make_env(config.env, config.motion, split="train")
         first = None if run.start_iteration else first_policy(config, env)
@@ -229,7 +232,7 @@ def _train(
     else:
         state = training.start(first)
     run.create()
-    hosts.agree(0)  # the others read what it has cut
+    processes.agree(0)  # the others read what it has cut
     if run.start_iteration:
         print(f"going on after iteration {run.start_iteration}")
     with contextlib.ExitStack() as stack:
@@ -255,7 +258,7 @@ def table_motion(config: TrainConfig) -> MotionConfig:
 def table_line(run: RunDir) -> str:
     """The command that makes the table of a finished run."""
     task = (run.config.env, EnvConfig()), (table_motion(run.config), MotionConfig())
-    words = [word for ours, theirs in task for word in cli.flags(ours, theirs, UNUSED)]
+    words = [word for ours, theirs in task for word in command_line.flags(ours, theirs, UNUSED)]
     return command.line("evaluate", run.path, *words)
 
 

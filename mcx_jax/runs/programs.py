@@ -20,13 +20,13 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh
 
-from mcx_jax.config import TrainConfig
+from mcx_jax.compute.sharding import env_mesh, put, shardings
+from mcx_jax.config.training import TrainConfig
 from mcx_jax.envs.v2v import V2VEnv
 from mcx_jax.ppo.rollout import layout, reset_all
-from mcx_jax.sharding import env_mesh, put, shardings
 
 if TYPE_CHECKING:
-    from mcx_jax.policy import Policy
+    from mcx_jax.policy.file import Policy
 
 RESET_STREAM = 1
 """Folded into a run's key for its resets; the rest of its random numbers come from another."""

@@ -5,10 +5,10 @@ import time
 from dataclasses import dataclass, field
 from typing import Any, TextIO
 
-from mcx_jax.config import TrainConfig
-from mcx_jax.paper import is_papers_world
-from mcx_jax.results import paper_means
-from mcx_jax.terminal import columns, paragraph
+from mcx_jax.config.training import TrainConfig
+from mcx_jax.console.terminal import columns, paragraph
+from mcx_jax.evaluation.paper import is_papers_world
+from mcx_jax.evaluation.statistics import paper_means
 
 PLAIN_INTERVAL_S = 10.0
 """Seconds between lines where the output is no terminal."""

@@ -17,9 +17,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TextIO
 
-from mcx_jax import checkpoint, cli, command, streams
-from mcx_jax.config import TrainConfig
+from mcx_jax.config import command_line
+from mcx_jax.config.training import TrainConfig
+from mcx_jax.console import command, streams
 from mcx_jax.errors import UserError, reason
+from mcx_jax.runs import checkpoint
 
 CONFIG = "config.json"
 METRICS = "metrics.jsonl"
@@ -43,7 +45,7 @@ class RunDir:
     start_iteration: int = 0
     """Iteration of the checkpoint to go on from; 0 = a new run."""
     writes: bool = True
-    """False in all but one of the processes that share a run (`mcx_jax.hosts`)."""
+    """False in all but one of the processes that share a run (`mcx_jax.compute.processes`)."""
     options: tuple[str, ...] = ()
     """Of the command line that began it, what config.json does not hold (--smoke, say)."""
     _open: contextlib.ExitStack = field(default_factory=contextlib.ExitStack, repr=False)
@@ -113,7 +115,7 @@ class RunDir:
         with writing(self.path):
             self.follow()
             if not (self.path / CONFIG).exists():
-                _write_whole(self.path / CONFIG, cli.config_to_json(self.config))
+                _write_whole(self.path / CONFIG, command_line.config_to_json(self.config))
             checkpoint.set_aside_after(self.path, self.start_iteration)
             _cut_metrics(self.path / METRICS, self.start_iteration)
             self._keep_metrics()
@@ -135,7 +137,7 @@ class RunDir:
         self.path = next(path for path in _names_like(old) if not os.path.lexists(path))
         self._claim()
         with writing(self.path):
-            _write_whole(self.path / CONFIG, cli.config_to_json(self.config))
+            _write_whole(self.path / CONFIG, command_line.config_to_json(self.config))
             if self._metrics:
                 self._metrics.seek(0)
                 _write_whole(self.path / METRICS, self._metrics.read())
@@ -202,7 +204,7 @@ def stored_config(path: Path) -> TrainConfig:
         text = file.read_text("utf-8")
     except (OSError, UnicodeDecodeError):
         raise UserError(f"{file}: cannot be read, or is not text") from None
-    return cli.config_from_json(TrainConfig, text, str(file))
+    return command_line.config_from_json(TrainConfig, text, str(file))
 
 
 def open_new(path: Path, config: TrainConfig) -> RunDir:
@@ -211,7 +213,7 @@ def open_new(path: Path, config: TrainConfig) -> RunDir:
     Raises:
         UserError: it holds something already.
     """
-    cli.check_name("--run-dir", path)
+    command_line.check_name("--run-dir", path)
     if path.exists() and not path.is_dir():
         raise UserError(f"--run-dir {path}: is a file; name a directory")
     if not path.is_dir() or not any(p.name not in LEFT_OVER for p in path.iterdir()):
@@ -239,14 +241,14 @@ def open_existing(path: Path, config: TrainConfig, iteration: int = 0) -> RunDir
     _refuse_difference(path, config)
     iteration = iteration or checkpoint.latest(path) or 0
     if iteration:
-        checkpoint.check(path, iteration, cli.config_to_json(config))
+        checkpoint.check(path, iteration, command_line.config_to_json(config))
         _check_rows(path / METRICS, iteration)
     # Stopped before its first checkpoint it starts again from its beginning, which is exact.
     return RunDir(path, config, iteration)
 
 
 def _refuse_difference(path: Path, config: TrainConfig) -> None:
-    differs = cli.difference(stored_config(path), config)
+    differs = command_line.difference(stored_config(path), config)
     if differs:
         raise UserError(
             f"{path}: holds a run with {differs}; name another directory with --run-dir"

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from types import FrameType
 from typing import Any, Self
 
-from mcx_jax import streams
+from mcx_jax.console import streams
 
 
 @dataclass

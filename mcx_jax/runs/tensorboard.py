@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from mcx_jax import extras
-from mcx_jax.config import TrainConfig
+from mcx_jax.config.training import TrainConfig
 
 
 def require() -> None:

@@ -1,7 +1,7 @@
 """`python -m mcx_jax.sea`: motion statistics of the generator beside the paper's table 1."""
 
 if __name__ == "__main__":
-    from mcx_jax.command import begin
+    from mcx_jax.console.command import begin
 
     begin()
 
@@ -10,7 +10,7 @@ import math
 import sys
 from dataclasses import dataclass
 
-from mcx_jax import cli
+from mcx_jax.config import command_line
 from mcx_jax.sea.spectrum import SEAS
 from mcx_jax.sea.statistics import (
     WANTED_ANGULAR_RAD_S,
@@ -63,15 +63,15 @@ def lines(figures: dict) -> list[str]:
 def main(argv: list[str] | None = None) -> None:
     """Print the statistics of the chosen calibration; 8 hours of motion per sea state."""
     argv = list(sys.argv[1:] if argv is None else argv)
-    config = cli.parse(SeaConfig, argv, prog="sea")
-    cli.check_output("--json", config.json)
+    config = command_line.parse(SeaConfig, argv, prog="sea")
+    command_line.check_output("--json", config.json)
     figures = report(goal_speed(build_tables(list(SEAS.values()), "train")))
     print("\n".join(lines(figures)))
     if config.json:
-        cli.write_output("--json", config.json, json.dumps(figures, indent=1) + "\n")
+        command_line.write_output("--json", config.json, json.dumps(figures, indent=1) + "\n")
 
 
 if __name__ == "__main__":
-    from mcx_jax.startup import run_command
+    from mcx_jax.compute.startup import run_command
 
     run_command(main)

@@ -24,8 +24,8 @@ from typing import Literal
 
 import numpy as np
 
+from mcx_jax.console.notice import notice
 from mcx_jax.errors import UserError
-from mcx_jax.notice import notice
 from mcx_jax.sea.tables import KNOT_DT_S, SPLIT_GAP_S, MotionTables
 
 COLUMNS = ("t", "x", "y", "z", "roll", "pitch", "yaw")

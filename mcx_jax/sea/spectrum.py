@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mcx_jax.env_config import COUPLED
+from mcx_jax.config.task import COUPLED
 from mcx_jax.errors import UserError
 
 GRAVITY_M_S2 = 9.81

@@ -3,7 +3,7 @@
 An inverse FFT sums all harmonic components at once (deterministic amplitudes, uniform phases, as
 SIMO does), so an hour costs milliseconds and needs no per-environment state: an episode is a table
 number and a start. Everything stored here is scaled by Froude's law: lengths / 10, time / sqrt(10),
-angles and accelerations unchanged. Sampling: `mcx_jax.sea.sampler`.
+angles and accelerations unchanged. Sampling: `mcx_jax.envs.sampler`.
 """
 
 import functools
@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from mcx_jax.delay import PHYSICS_DT_S
+from mcx_jax.config.delay import PHYSICS_DT_S
 from mcx_jax.sea.hydro import VesselKnobs, load_hydro, motion_rao
 from mcx_jax.sea.spectrum import GRAVITY_M_S2, SeaState, jonswap, spreading_weights, steepest_hs_m
 
