@@ -11,7 +11,8 @@ PYTHON ?= $(firstword $(foreach p,python3.11 python3.12 python3.13 python3,\
 
 VENV := .venv
 PY   := $(VENV)/bin/python
-PIP  := $(PY) -m pip install --disable-pip-version-check --progress-bar off -c constraints.txt
+# No byte-compiling of 2 GB, of which a process imports a fraction: Python does that on import.
+PIP  := $(PY) -m pip install --disable-pip-version-check --progress-bar off --no-compile -c constraints.txt
 
 .PHONY: help train bench test test-slow check format docs clean
 .DEFAULT_GOAL := help

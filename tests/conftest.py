@@ -11,12 +11,6 @@ import pytest
 # test draws, and the default would look for a display.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("MUJOCO_GL", "disable")
-# Tests compile for minutes to compute for seconds. Without LLVM's optimisation, which changes the
-# speed and the last bits alone, the suite takes half of the time. The processes that tests start
-# inherit it. A level that is set already stays, as in `make test-slow`.
-if "xla_backend_optimization_level" not in os.environ.get("XLA_FLAGS", ""):
-    quick = "--xla_backend_optimization_level=0"
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {quick}".strip()
 
 # A shell starts background jobs (nohup, some CI runners) with SIGINT ignored, and children inherit
 # it; the tests of Ctrl-C would then wait for an interrupt that never comes.

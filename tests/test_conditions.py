@@ -174,6 +174,7 @@ def test_the_goal_goes_round_its_circle(env, run):
     assert load_goal_path("static") is None
 
 
+@pytest.mark.slow
 def test_one_of_several_delays_is_that_delay_alone(run):
     """Same key, same windows and goal: what is drawn besides does not change them."""
     quiet = EnvConfig(delay="E0,E2", integrator="implicitfast", episode_steps=40)
@@ -211,6 +212,7 @@ def test_nothing_is_drawn_by_default():
     assert not config.conditions.imperfect_sensor
 
 
+@pytest.mark.slow
 def test_corrections_are_bounded(env):
     state = env.reset(jax.random.key(1))
     bound = env.config.max_correction

@@ -81,6 +81,7 @@ def test_preview_beats_the_baseline_and_says_by_how_much(ik_rows, preview_rows):
     assert all(row["improvement"]["pos"]["max"] == 0.0 for row in ik_rows), "baseline untouched"
 
 
+@pytest.mark.slow
 def test_a_command_in_its_own_process_gives_the_same_json(ik_rows, tmp_path):
     out = tmp_path / "rows.json"
     options = ["--delay", "E2", "--integrator", "implicitfast", "--episode-steps", "70"]

@@ -414,6 +414,7 @@ def test_steers_c_mujoco_along_the_same_trajectory(policy, exported, strong_arm)
     assert apart[0] < 2e-5 and apart[1] < 2e-5
 
 
+@pytest.mark.slow
 def test_steers_the_papers_arm_in_c_mujoco_as_well_as_evaluate_says(policy, exported):
     """Its servo chatters under Euler, which is chaotic: means."""
     runner = numpy_policy.Policy(exported["npz"])

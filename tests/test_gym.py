@@ -485,6 +485,7 @@ def test_pictures_are_of_the_episode_that_is_stepped(pictured):
     assert gym.V2V(**QUIET).render() is None
 
 
+@pytest.mark.slow
 def test_pictures_of_many_are_those_of_single_ones(opengl, pictured):
     settings = QUIET | {"render_mode": "rgb_array"}
     many = gymnasium.make_vec(gym.ENV_ID, num_envs=MANY, **settings)

@@ -93,6 +93,7 @@ def assert_alike(ours, theirs):
             np.testing.assert_allclose(a[name], b[name], rtol=2e-3, atol=1e-4, err_msg=name)
 
 
+@pytest.mark.slow
 def test_two_processes(repo_root, place, pair):
     folder, _ = place
     run, whole = folder / "both", alone(repo_root, place, "whole")

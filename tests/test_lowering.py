@@ -86,7 +86,7 @@ def check_a_run(algo: str, physics: str) -> None:
     assert len(program) > 1e5
 
 
-@pytest.mark.parametrize("algo", ["ppo", "first-order"])
+@pytest.mark.parametrize("algo", ["ppo", pytest.param("first-order", marks=pytest.mark.slow)])
 def test_a_training_iteration_has_nothing_that_a_gpu_or_tpu_lacks(algo):
     check_a_run(algo, "chain")
 

@@ -59,7 +59,10 @@ def start(m: mjx.Model, mj: mujoco.MjModel) -> mjx.Data:
     return d.replace(qvel=qd, ctrl=ctrl, qfrc_applied=applied, xfrc_applied=wrench)
 
 
-@pytest.mark.parametrize("integrator", arms.INTEGRATORS)
+@pytest.mark.parametrize(
+    "integrator",
+    [pytest.param(x, marks=pytest.mark.slow if x != "euler" else ()) for x in arms.INTEGRATORS],
+)
 def test_a_loop_written_for_mjx_gives_the_same(integrator):
     mj = model("four", integrator)
     compiled = functools.partial(jax.jit, compiler_options=arms.QUICK)

@@ -211,8 +211,14 @@ def check(errors: dict[str, float]) -> None:
         assert error < TOLERANCE[name], f"{name}: {error:.1e}"
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
-@pytest.mark.parametrize(("engine", "integrator"), ENGINES)
+@pytest.mark.parametrize(
+    ("engine", "integrator", "dtype"),
+    [
+        pytest.param(*pair, dtype, marks=pytest.mark.slow if slow else ())
+        for pair in ENGINES
+        for dtype, slow in (("float64", False), ("float32", pair[0] == "mjx"))
+    ],
+)
 def test_one_step_from_random_states(engine, integrator, dtype):
     states = random_states(4 * ROWS, seed=1)
     for k in range(4):
@@ -286,6 +292,7 @@ def weighted(advance, count: int):
     return value
 
 
+@pytest.mark.slow
 def test_gradient_of_ten_steps():
     """The chain engine's reverse mode against central differences and against MJX."""
     mj = load_mujoco("ur10e")
@@ -309,7 +316,10 @@ def test_gradient_of_ten_steps():
     assert np.all(np.abs(slope).reshape(4, 6).max(1) > 1e-3)
 
 
-@pytest.mark.parametrize("integrator", ["euler", "implicitfast", "quiet"])
+@pytest.mark.parametrize(
+    "integrator",
+    ["euler", *(pytest.param(x, marks=pytest.mark.slow) for x in ("implicitfast", "quiet"))],
+)
 def test_smooth_is_the_value_of_one_and_the_derivative_of_unlimited_servos(integrator):
     """Also where both servos are at their limits, and their own derivative by the command is 0."""
     mj = load_mujoco("paper")

@@ -56,6 +56,7 @@ def take(env):
     return simulate(env, "extrapolate", CLASSICAL["extrapolate"], sea=0, seed=SEED, episode=EPISODE)
 
 
+@pytest.mark.slow
 def test_an_episode_is_evaluates(env, take):
     both = errors_beside_ik(
         "extrapolate", CLASSICAL["extrapolate"], env, episodes=EPISODES, seed=SEED
@@ -256,6 +257,7 @@ def command(*argv):
     return [sys.executable, "-m", "mcx_jax.play", *argv], environment
 
 
+@pytest.mark.slow
 def test_film_has_its_frames_and_something_in_them(tmp_path, repo_root):
     import imageio_ffmpeg as ffmpeg
 
@@ -297,6 +299,7 @@ def rounds(count):
     return lambda: next(left, None) is None
 
 
+@pytest.mark.slow
 def test_page_answers_and_builds_the_scene(player):
     with urllib.request.urlopen(player.url, timeout=20) as answer:
         assert answer.status == 200 and b"<html" in answer.read()[:2000].lower()
@@ -374,6 +377,7 @@ def test_every_drawn_geom_is_in_the_page(player):
         assert radius >= model.geom_rbound[geom] * 0.70
 
 
+@pytest.mark.slow
 def test_a_new_choice_is_shown_while_the_page_is_paused(player):
     player.run(rounds(2))
     player.playing = False

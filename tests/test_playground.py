@@ -58,6 +58,7 @@ def test_properties(env):
     assert all(x.dtype == jnp.float32 and x.shape == () for x in state.metrics.values())
 
 
+@pytest.mark.slow
 def test_is_the_task(env, program):
     keys = jax.random.split(jax.random.PRNGKey(4), MANY)
     first, last, rewards, dones = program(keys, ACTIONS, jnp.zeros(MANY))

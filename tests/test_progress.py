@@ -196,6 +196,7 @@ def _no_save():
     raise RuntimeError("killed")
 
 
+@pytest.mark.slow
 def test_several_seeds_have_curves_of_their_own(tmp_path):
     train(open_new(tmp_path / "run", replace(TINY, seeds=2, seed=5)), _make_env, events=True)
     curves = _curves(tmp_path / "run")

@@ -201,6 +201,7 @@ def test_noise_sweep_has_evaluates_numbers(made, html):
         assert {row["sea"] for row in stored["noise"]} == {"Wb"}
 
 
+@pytest.mark.slow
 def test_without_the_noise_sweep_nothing_of_an_earlier_one_is_left(made, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(made[0], out)
@@ -210,6 +211,7 @@ def test_without_the_noise_sweep_nothing_of_an_earlier_one_is_left(made, tmp_pat
     assert "Measurement noise" not in (out / "index.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_other_levels_of_noise_are_the_same_program():
     env = evaluation_env(TASK, MotionConfig(sea="Wb"))
     ik = load_controller("ik")[1]

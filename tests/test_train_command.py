@@ -278,7 +278,7 @@ def test_a_row_without_a_number_that_is_needed(name, finished, tmp_path, capsys)
     )
 
 
-@pytest.mark.parametrize("seeds", [1, 2])
+@pytest.mark.parametrize("seeds", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_start_from_a_policy(finished, tmp_path, seeds):
     """Its weights and statistics in every seed; the rest of the state is a new run's."""
     config = replace(CONFIG, start_from=str(finished), seeds=seeds)
@@ -549,6 +549,7 @@ def test_short_time():
     assert [short_time(s) for s in (12.4, 200, 3900)] == ["12 s", "3 min 20 s", "1 h 05 min"]
 
 
+@pytest.mark.slow
 def test_restored_checkpoint_of_another_size_is_refused(finished):
     like = _like(replace(CONFIG, num_envs=16))
     with pytest.raises(UserError, match="cannot be restored"):
