@@ -7,7 +7,7 @@
 
 Every command runs in an empty directory that has `docs` and `runs` of this source tree. Its output
 is stored in docs/printed/NAME.txt, and stands on a page between `<!-- printed: NAME ... -->` and
-`<!-- end -->`, so that a page is complete wherever it is read. Output of a computation ends with
+`<!-- end -->`, so that a page is complete wherever it is read; `NAME:14` is its first 14 lines. Output of a computation ends with
 the commit, the day and the machine, and needs a clean tree.
 """
 
@@ -40,7 +40,7 @@ EXTRAPOLATE = "evaluate extrapolate --delay B4_4 --sea Wd"
 POLICY = "evaluate runs/B4_4-first-order-s0 --delay"
 SLOW = {
     "shipped": "evaluate shipped:B4_4 --delay B4_4",
-    "quick-train": "train --algo first-order --total-steps 500000 --run-dir runs/quick",
+    "quick-train": "train --algo first-order --total-steps 700000 --run-dir runs/quick",
     "sea": "sea",
     "ik": "evaluate ik --delay B4_4 --sea all",
     "extrapolate": EXTRAPOLATE,
@@ -88,7 +88,7 @@ def printed(command: str) -> str:
         )
     if done.returncode not in (0, 2) or "Traceback" in done.stdout:
         raise SystemExit(f"{command}: exit code {done.returncode}\n{done.stdout}")
-    return tidied(done.stdout)
+    return tidied(done.stdout.replace(f"{os.path.realpath(folder)}/", ""))
 
 
 def tidied(text: str) -> str:
@@ -111,13 +111,20 @@ def commit() -> str:
     return name
 
 
+def stored(name: str) -> str:
+    """Stored output, `NAME`, or its first lines, `NAME:COUNT`."""
+    name, _, count = name.partition(":")
+    lines = (FOLDER / f"{name}.txt").read_text().rstrip("\n").split("\n")
+    return "\n".join([*lines[: int(count)], "..."] if count else lines)
+
+
 def filled(page: str) -> str:
     """A page with its boxes filled from `printed: NAME ...` (stored output) or `file: PATH`."""
 
     def box(match: re.Match[str]) -> str:
         kind, names = match[1], match[2].split()
-        paths = [FOLDER / f"{x}.txt" if kind == "printed" else ROOT / x for x in names]
-        text = "\n".join(path.read_text().rstrip("\n") for path in paths)
+        show = stored if kind == "printed" else lambda name: (ROOT / name).read_text().rstrip("\n")
+        text = "\n".join(show(name) for name in names)
         language = "text" if kind == "printed" else "bash"
         return f"<!-- {kind}: {match[2]} -->\n```{language}\n{text}\n```\n<!-- end -->"
 
