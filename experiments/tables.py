@@ -80,7 +80,7 @@ def headline() -> str:
     cells = {(r["who"], r["sea"]): r for r in _everyone("B4_4")}
     columns = {
         "no correction (`ik`)": "ik",
-        "best without learning (`fir`)": "fir",
+        "best without a network (`fir`)": "fir",
         "here, PPO": "ppo",
         "here, first-order": "first-order",
     }

@@ -7,8 +7,8 @@
 
 Every command runs in an empty directory that has `docs` and `runs` of this source tree. Its output
 is stored in docs/printed/NAME.txt, and stands on a page between `<!-- printed: NAME ... -->` and
-`<!-- end -->`, so that a page is complete wherever it is read; `NAME:14` is its first 14 lines. Output of a computation ends with
-the commit, the day and the machine, and needs a clean tree.
+`<!-- end -->`, so that a page is complete wherever it is read; `NAME:14` is its first 14 lines.
+Output of a computation ends with the commit, the day and the machine, and needs a clean tree.
 """
 
 import datetime
