@@ -40,11 +40,10 @@ What mcx_jax (Apache-2.0) needs to run, with the versions of `constraints.txt`; 
 `python tools/licences.py` from the packages' own metadata, checked by `tests/test_packaging.py`.
 None is under the GPL or AGPL.
 
-`imageio-ffmpeg` brings an FFmpeg program of its own, which is under the GPL and runs as a process
-of its own. Not in the table: `sb3` and `cuda`; `hydro`, whose
-Capytaine is under the GPL and only remakes a data file (`tools/hydro`): nothing in `mcx_jax`
-imports it. Wheels may hold libraries with licences of their own, such as the Fortran run-time
-library in SciPy's: see the packages.
+`imageio-ffmpeg` brings an FFmpeg program, which is under the GPL and runs as a process of its own.
+Not in the table: `sb3`, `cuda` and `hydro`. Capytaine 3 (extra `hydro`, Apache-2.0) only remakes a
+data file (`tools/hydro`); nothing in `mcx_jax` imports it. Wheels may hold libraries with licences
+of their own, such as the Fortran run-time library in SciPy's: see the packages.
 
 | package | version | licence | needed by |
 | --- | --- | --- | --- |
