@@ -26,7 +26,7 @@ help:  ## this list
 train: $(VENV)/.run  ## train an agent for DELAY, ending with its table beside baseline and paper
 	$(PY) -m mcx_jax.train --delay $(DELAY) --num-envs $(NUM_ENVS) $(ARGS)
 
-bench: $(VENV)/.run  ## how fast everything is here, rivals included; let nothing else run
+bench: $(VENV)/.run  ## benchmark everything, C MuJoCo and MJX included, on an idle machine
 	$(PY) -m mcx_jax.bench $(ARGS)
 
 test: check  ## lint, format, types, then the tests but the slow ones, cheap ones first
@@ -40,7 +40,7 @@ check: $(VENV)/.dev  ## lint, format and types only
 	$(PY) -m ruff format --check .
 	$(PY) -m pyright --pythonpath $(PY)
 
-format: $(VENV)/.dev  ## mend what ruff can mend
+format: $(VENV)/.dev  ## apply ruff's automatic fixes
 	$(PY) -m ruff check --fix .
 	$(PY) -m ruff format .
 

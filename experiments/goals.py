@@ -1,4 +1,4 @@
-"""A goal that moves on vessel B's deck (the paper's future work), B4_4: who follows it.
+"""Tracking a goal that moves on vessel B's deck (the paper's future work), delay B4_4.
 
     python experiments/goals.py
 

@@ -51,7 +51,7 @@ class Row:
     wrist_inertia: float = 1.0
     quiet: float = 0.0
     sea: str = ""
-    """"" = the four of the paper."""
+    """Empty: the paper's four seas."""
     coupled: bool = False
 
 

@@ -1,7 +1,7 @@
 """`python -m mcx_jax.train --delay D --num-envs N`: train a policy; see `--help`.
 
 Writes DIR/{config.json, metrics.jsonl, checkpoints/, policy.npz}. The command line is read and the
-directory checked before anything is computed, so that a mistake is told at once.
+directory checked before anything is computed, so that mistakes are reported immediately.
 """
 
 if __name__ == "__main__":

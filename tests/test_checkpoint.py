@@ -211,7 +211,8 @@ def test_full_disk(room, tmp_path, monkeypatch, capfd):
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     message = str(error.value)
     assert "\n" not in message and "the checkpoint of iteration 4 cannot be written (" in message
-    assert "the checkpoint of iteration 2 is whole: mend this, then go on with --resume" in message
+    after = "the checkpoint of iteration 2 is whole: fix this, then continue with --resume"
+    assert after in message
     assert checkpoint.latest(tmp_path) == 2
     _same(checkpoint.restore(tmp_path, _state()), _state(2))
     checkpoint.save(tmp_path, 4, _state(4))

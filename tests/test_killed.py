@@ -184,6 +184,6 @@ def test_read_only_directory(tmp_path, monkeypatch):
         train(run, _make_env)
     monkeypatch.undo()
     assert str(error.value) == (
-        f"{path}: cannot be written (Read-only file system); mend this, then go on with --resume"
+        f"{path}: cannot be written (Read-only file system); fix this, then continue with --resume"
     )
     assert _contents(path) == before

@@ -1,4 +1,4 @@
-"""MuJoCo's own JAX engine behind the same function as `chain`: the reference inside JAX.
+"""MJX with the interface of `chain.substeps`: the reference engine in JAX.
 
 The arm's base is fixed and gravity is zero; the deck's motion enters as the inertial force and
 torque of the moving frame on every body (`xfrc_applied`), computed from MJX's own positions,

@@ -1,4 +1,4 @@
-"""How an episode's arm differs from its model: a load at the tool, another wrist, an integrator."""
+"""Per-episode model error: payload, wrist inertia, integrator."""
 
 from dataclasses import replace
 

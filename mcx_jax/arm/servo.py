@@ -1,4 +1,4 @@
-"""What the arm's servos are told: of every joint a position, and a velocity.
+"""Commands for the position and velocity servos.
 
 A reference is held for a control step of 20 ms in which the joint moves on. Its position servo,
 stiff enough to be at its force limit nearly always, pushes it forwards before it has reached the

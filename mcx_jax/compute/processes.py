@@ -209,7 +209,7 @@ def together(path: Path) -> Iterator[None]:
 
 
 def part() -> None:
-    """The end of the common work: from here on every process is on its own."""
+    """Shut down the distributed runtime; from here on processes run independently."""
     import jax
 
     if not alone():

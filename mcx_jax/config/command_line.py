@@ -106,7 +106,7 @@ def flags(config: Any, default: Any, leave_out: tuple[str, ...] = ()) -> list[st
 
 
 def _one_line(box: str) -> str:
-    """The message inside tyro's box, in our words where tyro speaks Python."""
+    """Extract tyro's message and rephrase its Python-level errors."""
     text = _box_text(box)
     if match := re.search(r"Error parsing (--\S+): invalid literal for int.*: '(.*)'", text):
         return f"{match[1]} {match[2]}: must be a whole number"

@@ -1,4 +1,4 @@
-"""How late an arm answers: the names of delays, and what they mean. And the rates of time.
+"""Actuation delays: names, parsing and group delay.
 
 A delay is named on the command line (`--delay`); `mcx_jax.arm.lag` is what it does.
 """

@@ -41,7 +41,7 @@ def parse_range(flag: str, text: str, limit: float, whole: bool = False) -> Rang
 
 @dataclass(frozen=True)
 class ConditionsConfig:
-    """What is not as it should be: a number, or LOW:HIGH for one drawn in each episode, uniformly
+    """Disturbances: each a number, or LOW:HIGH to draw one per episode, uniformly
     (noise: uniformly in its root; the factor of the inertia: in its logarithm)."""
 
     noise_mm: str = "0"

@@ -1,4 +1,4 @@
-"""What is not as model and sensor say: its draw for an episode, and the measurement of the goal.
+"""Per-episode disturbances (sampled) and the resulting goal measurement.
 
 Everything here is None, and costs nothing, where the configuration leaves it out.
 """

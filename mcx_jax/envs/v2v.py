@@ -271,7 +271,7 @@ class V2VEnv:
         count: int,
         drawn: Conditions,
     ) -> ArmState:
-        """The engine behind one function: physics steps of 2 ms with the references held."""
+        """Advance the arm by `count` physics steps of 2 ms, references held, by either engine."""
         ctrl = servo.commands(self.model, reference, rate)
         # The engines advance a base at physics step i by the deck's motion at that instant.
         if self.mjx_model is None:

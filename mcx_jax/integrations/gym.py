@@ -62,7 +62,7 @@ RENDER_MODES = ("rgb_array",)
 
 @struct.dataclass
 class Told:
-    """What a learner is told of N environments."""
+    """What N environments return to the learner."""
 
     obs: Any
     """(N, 38); (N, 39) with the measurement's age, where `conditions` has `latency_steps`."""

@@ -35,7 +35,7 @@ def describe(net: PolicyNet, obs_size: int, config: str) -> dict[str, Any]:
 
     Args:
         obs_size: length of the observation.
-        config: JSON of the training run's configuration; what it does not say is left out.
+        config: JSON of the training run's configuration; fields missing from it are omitted.
     """
     known = {OBS_SIZE: OBS_TABLE, OBS_SIZE + 1: (*OBS_TABLE, AGE)}
     observation = known.get(obs_size, _unnamed("observation", obs_size))

@@ -1,4 +1,4 @@
-"""From a collected window to what the updates read: masks, values, advantages, sequences."""
+"""Turn a rollout window into training sequences: mask, values, advantages."""
 
 from dataclasses import replace
 
@@ -42,7 +42,7 @@ class Batch:
 
 @struct.dataclass
 class Judged:
-    """A window after the value network has looked at it.
+    """A window with values, advantages and targets.
 
     Attributes:
         batch: what the updates read.

@@ -11,7 +11,7 @@ def masked_mean(x: jax.Array, mask: jax.Array) -> jax.Array:
 
 
 def reported_mean(x: jax.Array, mask: jax.Array) -> jax.Array:
-    """`masked_mean` for people: NaN if the mask is nowhere 1."""
+    """Like `masked_mean`, but NaN when the mask is empty; for reporting."""
     return jnp.where(jnp.any(mask > 0), masked_mean(x, mask), jnp.nan)
 
 

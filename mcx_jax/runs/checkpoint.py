@@ -79,7 +79,7 @@ def save(run_dir: Path, iteration: int, state: Any, config: str = "") -> None:
         kept = f"the checkpoint of iteration {last} is whole" if last else "there is none yet"
         raise UserError(
             f"{folder}: the checkpoint of iteration {iteration} cannot be written "
-            f"({reason(error)}); {kept}: mend this, then go on with --resume"
+            f"({reason(error)}); {kept}: fix this, then continue with --resume"
         ) from None
 
 

@@ -44,7 +44,7 @@ class Watch:
             self._count(rows[k : k + seeds])
 
     def before_iteration(self, state: Any) -> None:
-        """Told of the state, which the iteration will consume."""
+        """Copy the state before the iteration donates its buffers, if it may be the last."""
         if self.lost == LIMIT - 1:
             self.before = jax.tree.map(jnp.copy, state)
 

@@ -3,7 +3,7 @@ messages.log if anything happened that a user should know.
 
 Opening decides what may happen before anything is written; nothing is ever written over. One
 process at a time holds it (`RunDir.held`), and whatever instant it is killed at, `--resume` goes on
-exactly (docs/trust.md). Needs no JAX device, so that a mistake is told at once.
+exactly (docs/trust.md). Needs no JAX device, so that mistakes are reported immediately.
 """
 
 import contextlib
@@ -335,10 +335,10 @@ def _write_whole(path: Path, text: str) -> None:
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """A disk that is full or may not be written is the user's to mend."""
+    """Report a full or read-only disk as a UserError."""
     try:
         yield
     except OSError as error:
         raise UserError(
-            f"{path}: cannot be written ({reason(error)}); mend this, then go on with --resume"
+            f"{path}: cannot be written ({reason(error)}); fix this, then continue with --resume"
         ) from None

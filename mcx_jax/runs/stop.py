@@ -16,13 +16,13 @@ class StopRequest:
     previous: dict[int, Any] = field(default_factory=dict)
 
     def __enter__(self) -> Self:
-        """Listen."""
+        """Install the signal handlers."""
         for signum in (signal.SIGINT, signal.SIGTERM):
             self.previous[signum] = signal.signal(signum, self._note)
         return self
 
     def __exit__(self, *exc: object) -> None:
-        """Give the signals back."""
+        """Restore the previous handlers."""
         for signum, handler in self.previous.items():
             signal.signal(signum, handler)
 
