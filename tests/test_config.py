@@ -323,7 +323,7 @@ def test_every_setting_is_read_somewhere(cls):
 @pytest.mark.parametrize("cls", ALL_CONFIGS)
 def test_every_setting_has_a_sentence(cls):
     """The command line's help is the string below each field."""
-    tree = dict(_package_trees())[Path(inspect.getfile(cls)).name]
+    tree = ast.parse(Path(inspect.getfile(cls)).read_text())
     body = next(n for n in tree.body if isinstance(n, ast.ClassDef) and n.name == cls.__name__).body
     described = {
         node.target.id
