@@ -63,7 +63,7 @@ def servo(
 ) -> tuple[mjx.Model, jax.Array]:
     """The same actuators written so that MJX's own formula gives C's force and derivative.
 
-    MJX forms gain * ctrl + bias . (1, length, velocity). Two things are mended, by value:
+    MJX forms gain * ctrl + bias . (1, length, velocity). Two things are corrected, by value:
     1. A position servo (bias[1] = -gain) of kp 1e5 subtracts two float32 products of 3e5 N m, 1e-4
        rad/s of noise a step. Its command is counted from the joint angle instead: ctrl - length
        with bias[1] = 0, so one product of the small difference.

@@ -18,7 +18,7 @@ FITTED = ("extrapolate-best", "fir")
 def policy_path(who: str) -> Path | None:
     """The policy file of a run directory or a policy file; None for a controller's name.
 
-    Needs no JAX, so that a mistyped name is told at once.
+    Needs no JAX, so that a mistyped name is reported immediately.
     """
     if who in WHO:
         return None
@@ -76,5 +76,5 @@ def fit_if_needed(
 
 
 def informed(env, known_delay: str):
-    """The task with controllers without learning told another delay ("": the true one)."""
+    """The task in which controllers without learning assume another delay ("": the true one)."""
     return env.replace(known_delay=parse_delay(known_delay)) if known_delay else env

@@ -2,7 +2,7 @@
 
 `extrapolate-best` is `extrapolate` with the lead that tracks best; `fir` predicts the goal by a
 linear filter of its last poses (finite impulse response), fitted by least squares. Both see what a
-policy sees of the goal, are told the delay and the age of measurements, and are fitted under the
+policy sees of the goal, know the delay and the age of measurements, and are fitted under the
 conditions they are evaluated under: they know more than a policy that was trained for many.
 """
 

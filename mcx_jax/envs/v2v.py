@@ -64,7 +64,7 @@ class V2VEnv:
         return self.config.delays
 
     def with_delay(self, delay: str) -> "V2VEnv":
-        """The same task with another `--delay`, and controllers that are told it."""
+        """The same task with another `--delay`, which controllers without learning know."""
         config = replace(self.config, delay=delay)
         return replace(self, config=config, known_delay=config.delays[0])
 

@@ -51,7 +51,7 @@ def bootstrap_interval(
     """Percentile bootstrap interval of the interquartile mean over seeds.
 
     Args:
-        values: (seeds,) or (strata, seeds): every row is drawn anew by itself, with replacement.
+        values: (seeds,) or (strata, seeds): every row is resampled by itself, with replacement.
     """
     table = np.atleast_2d(np.asarray(values, np.float64))
     rng = np.random.default_rng(seed)

@@ -61,7 +61,7 @@ RENDER_MODES = ("rgb_array",)
 
 
 @struct.dataclass
-class Told:
+class Transition:
     """What N environments return to the learner."""
 
     obs: Any
@@ -75,19 +75,21 @@ class Told:
 
 
 @jax.jit
-def _reset(env: V2VEnv, seeds: jax.Array, episodes: jax.Array) -> tuple[EnvState, Told]:
+def _reset(env: V2VEnv, seeds: jax.Array, episodes: jax.Array) -> tuple[EnvState, Transition]:
     keys = jax.vmap(lambda s, n: jax.random.fold_in(jax.random.key(s), n))(seeds, episodes)
     state = jax.vmap(env.reset, out_axes=-1)(keys)
-    return state, _tell(state)
+    return state, _transition(state)
 
 
 @jax.jit
 def _step(
     env: V2VEnv, state: EnvState, actions: jax.Array, limit: jax.Array
-) -> tuple[EnvState, Told]:
+) -> tuple[EnvState, Transition]:
     state = jax.vmap(partial(finite_step, env), in_axes=-1, out_axes=-1)(state, actions.T)
-    told = _tell(state)
-    return state, dataclasses.replace(told, truncated=told.truncated | (state.step >= limit))
+    transition = _transition(state)
+    return state, dataclasses.replace(
+        transition, truncated=transition.truncated | (state.step >= limit)
+    )
 
 
 def _checked(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
@@ -113,14 +115,14 @@ def _pick(mask: jax.Array, new: Any, old: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(mask, a, b), new, old)
 
 
-def _tell(state: EnvState) -> Told:
+def _transition(state: EnvState) -> Transition:
     metrics = state.metrics
     info = {
         "dp_mm": 1e3 * metrics.pos_error_m,
         "da_mrad": 1e3 * metrics.ang_error_rad,
         "valid": metrics.valid,
     }
-    return Told(state.obs.T, state.reward, state.done | ~metrics.valid, info)
+    return Transition(state.obs.T, state.reward, state.done | ~metrics.valid, info)
 
 
 class Episodes:
@@ -152,21 +154,21 @@ class Episodes:
                 raise UserError(f"seed {seed}: must be 0 to 2^32 - 1")
             self.seeds[i], self.numbers[i] = seed, -1
 
-    def reset(self, mask: np.ndarray) -> Told:
-        """The next episode of the environments in `mask` (N,); what is told of the others is not
-        to be used."""
+    def reset(self, mask: np.ndarray) -> Transition:
+        """The next episode of the environments in `mask` (N,); the entries of the other
+        environments are undefined."""
         self.numbers += mask
         # The others get an episode that is thrown away: one program, whatever the mask.
-        state, told = _reset(self.env, self.seeds, np.maximum(self.numbers, 0))
+        state, transition = _reset(self.env, self.seeds, np.maximum(self.numbers, 0))
         self.state = state if self.state is None else _pick(mask, state, self.state)
-        return _to_numpy(told)
+        return _to_numpy(transition)
 
-    def step(self, actions: np.ndarray) -> Told:
+    def step(self, actions: np.ndarray) -> Transition:
         """One control step of all; actions (N, 6) float32, cm and crad."""
         if self.state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
-        self.state, told = _step(self.env, self.state, actions, self.limit)
-        return _to_numpy(told)
+        self.state, transition = _step(self.env, self.state, actions, self.limit)
+        return _to_numpy(transition)
 
     def pictures(self) -> tuple[np.ndarray, ...]:
         """What each looks like now, (360, 640, 3) uint8.
@@ -196,9 +198,9 @@ def _live(settings: "_Settings", env: V2VEnv):
     return Live(env, settings.motion, settings.split)
 
 
-def _to_numpy(told: Told) -> Told:
+def _to_numpy(transition: Transition) -> Transition:
     """Copies that may be written to."""
-    return jax.tree.map(np.array, jax.device_get(told))
+    return jax.tree.map(np.array, jax.device_get(transition))
 
 
 @cache
@@ -295,9 +297,9 @@ class V2V(gymnasium.Env[np.ndarray, np.ndarray]):
         _no_options(options)
         self._check_limit()
         self._episodes.seed([seed], self.np_random)
-        told = self._episodes.reset(np.array([True]))
+        transition = self._episodes.reset(np.array([True]))
         self._taken = 0
-        return told.obs[0], _first(told.info)
+        return transition.obs[0], _first(transition.info)
 
     def _check_limit(self) -> None:
         """Nothing tells an environment that `gymnasium.make` cuts its episodes short; a reset after
@@ -308,10 +310,10 @@ class V2V(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """(observation, reward, False, truncated, info) after 20 ms; action (6,)."""
-        told = self._episodes.step(_checked(action, self._shape)[None])
+        transition = self._episodes.step(_checked(action, self._shape)[None])
         self._taken += 1
-        reward, truncated = float(told.reward[0]), bool(told.truncated[0])
-        return told.obs[0], reward, False, truncated, _first(told.info)
+        reward, truncated = float(transition.reward[0]), bool(transition.truncated[0])
+        return transition.obs[0], reward, False, truncated, _first(transition.info)
 
     def render(self) -> np.ndarray | None:
         """(360, 640, 3) uint8: the scene now; None without a render mode, as Gymnasium has it."""
@@ -412,35 +414,35 @@ class V2VVector(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._episodes.seed(seed, self.np_random)
         self._ended[:] = False
         everyone = np.ones(self.num_envs, bool)
-        told = self._episodes.reset(everyone)
-        return told.obs, _masked(told.info, everyone)
+        transition = self._episodes.reset(everyone)
+        return transition.obs, _masked(transition.info, everyone)
 
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """(observations, rewards, terminated, truncated, infos) after 20 ms; actions (N, 6)."""
         shape = self.num_envs, self._episodes.env.action_size
-        told, final = self._episodes.step(_checked(actions, shape)), {}
+        transition, final = self._episodes.step(_checked(actions, shape)), {}
         if self._next_step:
-            told = self._begin(self._ended, told)
-            self._ended = ended = told.truncated
-        elif (ended := told.truncated).any():
-            final = _final(told)
-            told = self._begin(ended, told)
-        info = _masked(told.info, np.ones(self.num_envs, bool)) | final
-        return told.obs, told.reward, np.zeros_like(ended), ended, info
+            transition = self._begin(self._ended, transition)
+            self._ended = ended = transition.truncated
+        elif (ended := transition.truncated).any():
+            final = _final(transition)
+            transition = self._begin(ended, transition)
+        info = _masked(transition.info, np.ones(self.num_envs, bool)) | final
+        return transition.obs, transition.reward, np.zeros_like(ended), ended, info
 
-    def _begin(self, mask: np.ndarray, told: Told) -> Told:
-        """`told`, with the next episodes where `mask` says so. A reward stays that of the step if
-        the episode ended in it."""
+    def _begin(self, mask: np.ndarray, transition: Transition) -> Transition:
+        """`transition`, with the next episodes where `mask` says so. The reward stays that of the
+        step in which the episode ended."""
         if not mask.any():
-            return told
+            return transition
         fresh = self._episodes.reset(mask)
-        return Told(
-            obs=np.where(mask[:, None], fresh.obs, told.obs),
-            reward=np.where(mask & self._next_step, 0, told.reward),
-            truncated=told.truncated & ~mask,
-            info={k: np.where(mask, fresh.info[k], v) for k, v in told.info.items()},
+        return Transition(
+            obs=np.where(mask[:, None], fresh.obs, transition.obs),
+            reward=np.where(mask & self._next_step, 0, transition.reward),
+            truncated=transition.truncated & ~mask,
+            info={k: np.where(mask, fresh.info[k], v) for k, v in transition.info.items()},
         )
 
     def render(self) -> tuple[np.ndarray, ...] | None:
@@ -461,13 +463,13 @@ def _autoreset(mode: AutoresetMode | str) -> AutoresetMode:
     return AutoresetMode(found)
 
 
-def _final(told: Told) -> dict[str, Any]:
+def _final(transition: Transition) -> dict[str, Any]:
     """Gymnasium's `final_obs` and `final_info`: the last of the episodes that have ended."""
-    ended = told.truncated
+    ended = transition.truncated
     obs = np.full(len(ended), None, object)
     for i in np.flatnonzero(ended):
-        obs[i] = told.obs[i]
-    last = {k: np.where(ended, v, np.zeros_like(v)) for k, v in told.info.items()}
+        obs[i] = transition.obs[i]
+    last = {k: np.where(ended, v, np.zeros_like(v)) for k, v in transition.info.items()}
     return _masked({"final_obs": obs, "final_info": _masked(last, ended)}, ended)
 
 

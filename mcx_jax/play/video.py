@@ -35,7 +35,7 @@ def write_film(
     """Write an .mp4 of a whole episode in real time; whole or not at all.
 
     Args:
-        say: told how far it is, every ten seconds.
+        say: receives the progress, every ten seconds.
 
     Returns:
         How many frames.

@@ -104,7 +104,7 @@ def noise_sweep(
 
 def _with_noise(env: V2VEnv) -> V2VEnv:
     """The same task, its observation made of what is measured. Any noise but 0 asks for that, and
-    always the same one, since another setting would compile anew."""
+    always the same one, since another setting would be compiled again."""
     asked = replace(env.config.conditions, noise_mm="1", noise_mrad="1")
     return replace(env, config=replace(env.config, conditions=asked))
 

@@ -143,7 +143,7 @@ def restore(run_dir: Path, like: Any, iteration: int | None = None) -> Any:
 
 def set_aside_after(run_dir: Path, iteration: int) -> None:
     """Give the checkpoints of later iterations names that are never restored: the run goes on from
-    an earlier one and writes them anew."""
+    an earlier one and writes them again."""
     for later in _iterations(run_dir):
         if later > iteration:
             name = run_dir / FOLDER / f"{later}.set-aside"

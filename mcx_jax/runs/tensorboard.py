@@ -13,7 +13,7 @@ def require() -> None:
 
 
 class EventFile:
-    """One event file of a run; a run that is gone on with gets another one beside it."""
+    """One event file of a run; a resumed run gets another one next to it."""
 
     def __init__(self, path: Path, config: TrainConfig, start_iteration: int) -> None:
         """Open a new file in the run's directory.
@@ -25,7 +25,7 @@ class EventFile:
 
         self._seeds = config.seeds
         first = start_iteration * config.steps_per_iteration + 1
-        # Names hold the second only: a run gone on with at once would overwrite the first file.
+        # Names hold the second only: a run resumed immediately would overwrite the first file.
         suffix = f".{start_iteration}"
         self._writer = SummaryWriter(str(path), purge_step=first, filename_suffix=suffix)
 

@@ -34,7 +34,7 @@ class VesselKnobs:
     in beam or quartering seas. So: nearly head seas, heavy heave/pitch damping. Starting from
     long-crested 170 deg, damping 0.35, roll 0.15, base amidships 3 m up and gamma 1, whose speeds
     are 7-13 % high while the angular rate grows too steeply from Wa (-8 %) to Wd (+6 %), three
-    changes mend it:
+    changes correct it:
 
     - base point 5 m up (speeds -5 %: surge and pitch cancel better) and 4 m aft (-3 to -9 %, most
       in Wa: heave and pitch cancel better): a pedestal on the work deck aft of a wheelhouse;
