@@ -33,7 +33,7 @@ test: check  ## lint, format, types, then the tests but the slow ones, cheap one
 	$(PY) -m pytest -m "not slow" -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-slow: $(VENV)/.dev  ## the slow ones: runs killed 24 times, own data and own arm from end to end
-	$(PY) -m pytest -m slow $(ARGS)
+	XLA_FLAGS=--xla_backend_optimization_level=2 $(PY) -m pytest -m slow $(ARGS)
 
 check: $(VENV)/.dev  ## lint, format and types only
 	$(PY) -m ruff check .

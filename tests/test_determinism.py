@@ -15,14 +15,11 @@ PARTS = ("ppo", "first-order", "episodes")
 def processes():
     """Digests of two processes, at the same time: [{part: (seed 0, seed 0 again, seed 1)}]."""
     folder = Path(__file__).parent
-    # The same bits at any level; at this one they compile in two thirds of the time.
-    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0".strip()
     started = [
         subprocess.Popen(
             [sys.executable, "repeat.py", "1"],
             cwd=folder,
-            env={**os.environ, "PYTHONPATH": str(folder.parent), "PYTHONHASHSEED": seed}
-            | {"XLA_FLAGS": flags},
+            env={**os.environ, "PYTHONPATH": str(folder.parent), "PYTHONHASHSEED": seed},
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

