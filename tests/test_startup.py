@@ -99,7 +99,7 @@ def test_import_sets_no_flag():
 def test_processes_meet_before_jax_looks_for_devices(monkeypatch):
     """Else `train --device gpu --distributed auto` would be too late for JAX."""
     order = []
-    monkeypatch.setattr(startup.hosts, "join", lambda text: order.append(text))
+    monkeypatch.setattr(startup.processes, "join", lambda text: order.append(text))
     monkeypatch.setattr(startup, "_check_device", lambda *_: order.append("devices"))
     monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))
     startup.configure("gpu", cores=1, distributed="auto")
