@@ -9,6 +9,9 @@ ARGS     ?=
 PYTHON ?= $(firstword $(foreach p,python3.11 python3.12 python3.13 python3,\
             $(if $(shell $(p) -c 'import sys; print((3, 11) <= sys.version_info < (3, 14) or "")' 2>/dev/null | grep True),$(p))))
 
+# A flag with the variable's value, unless ARGS has the flag: the command refuses one given twice.
+unless = $(if $(findstring $(1),$(ARGS)),,$(1) $(2))
+
 VENV := .venv
 PY   := $(VENV)/bin/python
 # No byte-compiling of 2 GB, of which a process imports a fraction: Python does that on import.
@@ -24,7 +27,7 @@ help:  ## this list
 	@echo "GPU: $(PY) -m pip install -c constraints.txt -e '.[cuda]' after the first make"
 
 train: $(VENV)/.run  ## train an agent for DELAY, ending with its table beside baseline and paper
-	$(PY) -m mcx_jax.train --delay $(DELAY) --num-envs $(NUM_ENVS) $(ARGS)
+	$(PY) -m mcx_jax.train $(call unless,--delay,$(DELAY)) $(call unless,--num-envs,$(NUM_ENVS)) $(ARGS)
 
 bench: $(VENV)/.run  ## benchmark everything, C MuJoCo and MJX included, on an idle machine
 	$(PY) -m mcx_jax.bench $(ARGS)

@@ -161,6 +161,14 @@ def test_python_m_mcx_jax_lists_every_command(repo_root, tracked, capsys):
     assert capsys.readouterr().out == f"{mcx_jax.__version__}\n"
 
 
+@pytest.mark.parametrize("given", ["", "--num-envs 512", "--delay=E2 --seed 3"])
+def test_make_train_gives_no_flag_twice(repo_root, given):
+    """The command refuses a flag that is given twice; the Makefile has values of its own."""
+    line = run("make", "-n", "train", f"ARGS={given}", cwd=repo_root).splitlines()[-1]
+    assert line.count("--num-envs") == line.count("--delay") == 1
+    assert line.split()[1:3] == ["-m", "mcx_jax.train"] and line.endswith(given)
+
+
 def test_a_command_that_is_none_is_one_line():
     with pytest.raises(UserError, match="^fly: no such command; use one of train, evaluate, "):
         commands.main(["fly"])
