@@ -160,7 +160,7 @@ def test_disk_full_while_training(what, tmp_path, monkeypatch, capsys):
             )
     assert stop.value.code == 2
     assert capsys.readouterr().err == (
-        f"error: {path}: cannot be written (No space left on device); mend this, then go on with "
+        f"error: {path}: cannot be written (No space left on device); fix this, then continue with "
         "--resume\n"
     )
     assert checkpoint.latest(path) == (2 if what == "append" else None)
