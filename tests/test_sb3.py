@@ -1,19 +1,22 @@
-"""Stable-Baselines3's PPO trains on the Gymnasium environment (extra `sb3`; skipped without)."""
+"""Stable-Baselines3's PPO trains on the Gymnasium environment.
+
+Slow set: the extra `sb3` brings PyTorch, 3 GB on Linux; without it the test is skipped.
+"""
 
 import numpy as np
 import pytest
 
 from mcx_jax.integrations.gym import ENV_ID
 
-sb3 = pytest.importorskip("stable_baselines3")
-
 STEPS = 16
 SETTINGS = {"delay": "E1", "sea": "Wa", "integrator": "implicitfast", "episode_steps": STEPS}
 
 
+@pytest.mark.slow
 # SB3 recommends actions in [-1, 1]; ours are in cm and crad.
 @pytest.mark.filterwarnings("ignore:.*recommend.*symmetric and normalized:UserWarning")
 def test_ppo_trains():
+    sb3 = pytest.importorskip("stable_baselines3")
     import torch
     from stable_baselines3.common.env_checker import check_env
     from stable_baselines3.common.env_util import make_vec_env
