@@ -332,6 +332,7 @@ def test_the_menu_is_evaluates():
     assert menu.trained_for["shipped:E2"] == "E2"
 
 
+@pytest.mark.slow
 def test_the_time_line_and_the_errors_are_where_the_slider_is(player):
     """While it is paused, too, and at pictures that are no multiple of PLOT_EVERY."""
     player.prepare(player.wanted)

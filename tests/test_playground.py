@@ -79,6 +79,7 @@ def test_is_the_task(env, program):
     assert not dones.any()  # the time limit is the wrapper's
 
 
+@pytest.mark.slow
 def test_a_diverged_environment_is_invalid_and_never_shown(program):
     keys = jax.random.split(jax.random.PRNGKey(4), MANY)
     poison = jnp.array([0.0, jnp.nan, 0.0])
